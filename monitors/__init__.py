@@ -1,0 +1,1 @@
+"""Statistics on correlator outputs and innovations, thresholds, and detection probabilities."""

@@ -1,0 +1,1 @@
+"""Correlator outputs and inertial data to position, velocity and time. Records: ``nav.records``."""

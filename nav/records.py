@@ -1,0 +1,50 @@
+"""Structured arrays that leave this package.
+
+Signs: innovation = measured - predicted; error state = true - estimate; u = unit vector receiver -> satellite.
+Frames are in the names: ecef, ned; ``C_bn`` rotates body (forward, right, down) into north-east-down.
+"""
+
+import numpy as np
+
+OBSERVATION = np.dtype(
+    [
+        ("sample_index", "u8"),
+        ("system", "S1"),
+        ("signal", "S4"),
+        ("prn", "i4"),
+        ("tow_tx_s", "f8"),  # transmit time, integer part of the ms kept exact: see tow_tx_ms
+        ("tow_tx_ms", "i8"),  # whole milliseconds of the transmit time
+        ("tow_tx_frac_s", "f8"),  # remainder, in [0, 1e-3)
+        ("pseudorange_m", "f8"),
+        ("pseudorange_smoothed_m", "f8"),
+        ("doppler_hz", "f8"),
+        ("carrier_phase_cycles", "f8"),
+        ("cn0_dbhz", "f8"),
+        ("lock_s", "f8"),
+        ("cycle_slip", "?"),
+    ]
+)
+"""One satellite at a common receiver sample."""
+
+SOLUTION = np.dtype(
+    [
+        ("sample_index", "u8"),
+        ("t_s", "f8"),
+        ("week", "i4"),
+        ("tow_s", "f8"),
+        ("pos_ecef_m", "f8", 3),
+        ("vel_ecef_mps", "f8", 3),
+        ("clock_bias_m", "f8"),
+        ("clock_drift_mps", "f8"),
+        ("isb_m", "f8"),  # Galileo minus GPS receiver bias
+        ("cov_ecef_m2", "f8", (3, 3)),
+        ("gdop", "f8"),
+        ("pdop", "f8"),
+        ("hdop", "f8"),
+        ("vdop", "f8"),
+        ("n_used", "i4"),
+        ("chi2", "f8"),
+        ("dof", "i4"),
+        ("valid", "?"),
+    ]
+)

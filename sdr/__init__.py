@@ -1,0 +1,1 @@
+"""Composition: scenario, receiver loop, storage, campaigns, figures and the command line."""

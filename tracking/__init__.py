@@ -1,0 +1,1 @@
+"""Samples to correlator outputs, NCO control and symbols. Signs and records: ``tracking.records``."""
