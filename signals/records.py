@@ -99,3 +99,14 @@ PVT_TRUTH = np.dtype(
     ]
 )
 """Truth of the receiver."""
+
+CODE_LINE = np.dtype(
+    [
+        ("signal", "S4"),
+        ("waveform", "S5"),  # b"BPSK", b"BOC11", b"CBOC+", b"CBOC-"
+        ("prn", "i4"),
+        ("freq_hz", "f8"),  # offset from the carrier; the mirror line at -freq_hz has the same level
+        ("level_db", "f8"),  # power of this one line, relative to the whole component
+    ]
+)
+"""One line of a code spectrum."""
