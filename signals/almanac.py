@@ -14,8 +14,8 @@ def reference_time(almanac: np.ndarray, step_s: int) -> tuple[int, int]:
 def elements(ephemeris: np.void, week: int, toa_s: int) -> dict[str, float]:
     """Almanac elements of one satellite at (week, toa_s), angles in rad.
 
-    M0 and af0 move with the mean motion and the clock drift. The node is reckoned from the start of the week of the
-    reference time, so it also moves by the Earth's rotation over whole weeks:
+    M0 and af0 move with the mean motion and the clock drift. The node is reckoned from the start of the week
+    of the reference time, so it also moves by the Earth's rotation over whole weeks:
     Omega0' = Omega0 + OmegaDot dt - OmegaE 604800 dweek (IS-GPS-200, table 20-IV, lines of the node).
     """
     mu = MU_GPS_M3_S2 if ephemeris["system"] == b"G" else MU_GALILEO_M3_S2
@@ -38,5 +38,5 @@ def elements(ephemeris: np.void, week: int, toa_s: int) -> dict[str, float]:
 
 
 def epoch_on_grid(tot_s: float, step_s: int) -> int:
-    """Multiple of `step_s` nearest to `tot_s` inside the week: where a polynomial's reference time may lie."""
+    """Multiple of `step_s` nearest to `tot_s` inside the week: where a reference time may lie."""
     return min(round(tot_s / step_s), (SECONDS_PER_WEEK - 1) // step_s) * step_s

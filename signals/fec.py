@@ -1,7 +1,7 @@
 """Channel coding of Galileo I/NAV: CRC-24Q, convolutional code, Viterbi decoder, block interleaver.
 
-Bits are uint8 (0 or 1). Symbols are soft, + = logic 0. Source: Galileo OS SIS ICD, 4.1.4 (FEC, interleaving) and
-5.1.9.4 (CRC).
+Bits are uint8 (0 or 1). Symbols are soft, + = logic 0. Source: Galileo OS SIS ICD, 4.1.4 (FEC, interleaving)
+and 5.1.9.4 (CRC).
 """
 
 import numpy as np
@@ -10,7 +10,7 @@ from numba import njit
 CRC24Q = 0x1864CFB
 """Generator of CRC-24Q (Galileo OS SIS ICD, 5.1.9.4; Qualcomm): initial value 0, no reflection."""
 G1, G2 = 0o171, 0o133
-"""Generators of the rate 1/2, K = 7 code, newest bit = leftmost tap; the output of G2 is inverted (ICD, 4.1.4.1)."""
+"""Generators of the rate 1/2, K = 7 code, newest bit = leftmost tap; G2's output is inverted (ICD, 4.1.4.1)."""
 INTERLEAVER_COLUMNS, INTERLEAVER_ROWS = 30, 8
 """Block interleaver of one page part (ICD, 4.1.4.2)."""
 
@@ -106,7 +106,7 @@ def viterbi(soft: np.ndarray) -> np.ndarray:
 
 
 def interleave(symbols: np.ndarray) -> np.ndarray:
-    """Order of transmission of the 240 symbols of a page part: written by columns of 8, read by rows of 30."""
+    """Order of transmission of the 240 symbols of a part: written in columns of 8, read in rows of 30."""
     return symbols.reshape(INTERLEAVER_COLUMNS, INTERLEAVER_ROWS).T.ravel()
 
 

@@ -1,7 +1,7 @@
 """Bit fields of navigation messages: one table serves the encoder and the decoder.
 
-A message is a Python integer of `n_bits` bits; bit 1 is the first transmitted bit and the most significant one, as
-in the ICDs. A table is a tuple of `Field`; bits that no field covers are zero.
+A message is a Python integer of `n_bits` bits; bit 1 is the first transmitted bit and the most significant
+one, as in the ICDs. A table is a tuple of `Field`; bits that no field covers are zero.
 """
 
 from collections.abc import Mapping
@@ -15,10 +15,10 @@ from signals.constants import GNSS_PI
 class Field(NamedTuple):
     """One field: its record name, its places, and how the integer on air becomes a number.
 
-    `spans` are (first bit, number of bits) pairs, most significant part first. `kind` is "u" (unsigned) or "s"
-    (two's complement). A field in semicircles becomes radians (times `GNSS_PI`). `exact` fields (times, indices) must
-    be whole multiples of the scale. `cyclic` fields are angles modulo one turn. `top` is the largest integer allowed
-    where the bits could hold more.
+    `spans` are (first bit, number of bits) pairs, most significant part first. `kind` is "u" (unsigned) or
+    "s" (two's complement). A field in semicircles becomes radians (times `GNSS_PI`). `exact` fields (times,
+    indices) must be whole multiples of the scale. `cyclic` fields are angles modulo one turn. `top` is the
+    largest integer allowed where the bits could hold more.
     """
 
     name: str

@@ -1,7 +1,7 @@
 """Galileo I/NAV on E1-B: the tables of the words, the encoder and the decoder side by side.
 
-Source: Galileo OS SIS ICD, 4.1.4 (coding), 4.3 (pages, order of words), 5.1 (contents). A word is an integer of 128
-bits. Weeks are continuous GPS weeks (GST week + 1024) outside the message.
+Source: Galileo OS SIS ICD, 4.1.4 (coding), 4.3 (pages, order of words), 5.1 (contents). A word is an integer
+of 128 bits. Weeks are continuous GPS weeks (GST week + 1024) outside the message.
 """
 
 import numpy as np
@@ -9,8 +9,9 @@ import numpy as np
 from signals import fec
 from signals.almanac import elements, epoch_on_grid, reference_time
 from signals.constants import GNSS_PI, SECONDS_PER_WEEK
-from signals.fields import Field, bits_of, integer, pack, unpack
-from signals.records import EPHEMERIS
+from signals.fields import Field, bits_of, integer, message_of, pack, unpack
+from signals.lnav import nearest_week
+from signals.records import EPHEMERIS, IONO_UTC
 
 SYMBOL_MS = 4
 PART_SYMBOLS, PAGE_SYMBOLS = 250, 500
@@ -25,7 +26,7 @@ SECONDARY_SYNC = (0b00000100, 0b00101011, 0b00101111)
 REFERENCE_SQRT_A = np.sqrt(29_600_000.0)
 REFERENCE_INCLINATION_RAD = 56.0 / 180.0 * GNSS_PI
 
-# --- tables -----------------------------------------------------------------------------------------------------
+# --- tables -------------------------------------------------------------------------------------------------
 
 
 TYPE = integer("type", 1, 6)
@@ -187,7 +188,7 @@ ORDER = (
 )
 """Word types of the 15 pages of even and odd sub-frames of 30 s; 63 stands for words 16 to 20 and 22."""
 
-# --- encoder ----------------------------------------------------------------------------------------------------
+# --- encoder ------------------------------------------------------------------------------------------------
 
 
 def page_symbols(word: int, secondary_sync: int = 0, page_type: int = 0) -> np.ndarray:
@@ -249,7 +250,7 @@ def _ggto(iono_utc: np.void | None, where: str) -> int:
 
 
 def almanac_groups(almanac: np.ndarray | None) -> list[list[np.void]]:
-    """Galileo satellites in threes by number; those whose orbit the format cannot hold (E14, E18) are left out."""
+    """Galileo satellites in threes by number; orbits that the format cannot hold (E14, E18) are left out."""
     if almanac is None:
         return [[]]
     records = [r for r in np.sort(np.atleast_1d(almanac), order="prn") if r["system"] == b"E"]
@@ -306,14 +307,16 @@ def encode(
     tow_s: int,
     n_symbols: int,
 ) -> np.ndarray:
-    """I/NAV symbols of one satellite on E1-B as transmitted from (week, tow_s) on; GST and GPS seconds coincide.
+    """I/NAV symbols of one satellite on E1-B as transmitted from (week, tow_s) on; GST and GPS seconds
+    coincide.
 
     Parameters
     ----------
-    ephemeris : EPHEMERIS record, or array of records of this satellite; one of several comes into force on the first
-        30 s sub-frame at or after its toe.
+    ephemeris : EPHEMERIS record, or array of records of this satellite; one of several comes into force on
+        the first 30 s sub-frame at or after its toe.
     iono_utc : IONO_UTC record (NeQuick, UTC, GGTO), or None: word 6 a dummy, GGTO marked absent, ai zero.
-    almanac : EPHEMERIS array, reduced to almanacs at the latest toe, three satellites a minute; None: none (SVID 0).
+    almanac : EPHEMERIS array, reduced to almanacs at the latest toe, three satellites a minute; None: none
+        (SVID 0).
     week, tow_s : continuous GPS week (GST week + 1024) and whole second of the first symbol.
     n_symbols : number of 4 ms symbols.
 
@@ -386,3 +389,283 @@ def quantised(ephemeris: np.void) -> np.void:
                 record[name] = value
     record["iodc"] = record["iode"]
     return record
+
+
+# --- decoder ------------------------------------------------------------------------------------------------
+
+
+def decode_part(symbols: np.ndarray) -> tuple[np.ndarray, int]:
+    """Bits of one page part and its polarity.
+
+    Parameters
+    ----------
+    symbols : float32 (250,) soft symbols, + = logic 0, possibly inverted; the first ten are the sync pattern.
+
+    Returns
+    -------
+    uint8 (120,) bits, and +1 (upright) or -1 (inverted), from the soft correlation with the sync pattern.
+    """
+    polarity = 1 if float(symbols[:10] @ SYNC_SIGNS) >= 0.0 else -1
+    return fec.viterbi(fec.deinterleave(symbols[10:]) * np.float32(polarity)), polarity
+
+
+def page_word(even: np.ndarray, odd: np.ndarray) -> tuple[int, bool]:
+    """Word of 128 bits from the bits of an even and an odd part, and whether the CRC over both holds."""
+    crc_ok = fec.crc24q(np.concatenate((even[:114], odd[:106]))) == 0
+    return message_of(np.concatenate((even[2:114], odd[2:18]))), crc_ok
+
+
+class Decoder:
+    """I/NAV symbols of one satellite to time, ephemeris, health, ionosphere and GGTO.
+
+    Symbols may be inverted as a whole: the sync pattern of each part tells. A place is accepted as the start
+    of a page if two sync patterns 250 symbols apart fit (at most two wrong of 20) and the CRC of the page
+    between holds; time counts once two words agree on it.
+
+    Parameters
+    ----------
+    prn : satellite; words 4 of another SVID are refused.
+
+    Attributes
+    ----------
+    synced, polarity : +1 upright, -1 inverted, 0 unknown.
+    ephemeris : EPHEMERIS record or None; words 1 to 4 of one IODnav, newest set, with word 5.
+    iono_utc, iono_utc_valid : IONO_UTC record and the set of its parts received ("nequick", "utc", "ggto").
+    ggto : (a0g_s, a1g_s_s, t0g_s, week_0g), GST minus GPS time, or None.
+    almanac : SVID -> dict of almanac elements.
+    health, healthy : E1B_DVS + 2 E1B_HS; healthy is None before word 5.
+    svid : of the last word 4.
+    pages_ok, pages_failed, pages_alert : counts while synced (alert pages cannot be checked on E1-B alone).
+    words : number of good pages by word type.
+    """
+
+    symbol_ms = SYMBOL_MS
+    symbols_per_week = SECONDS_PER_WEEK * 1000 // SYMBOL_MS
+    lost_after = 5  # pages that fail in a row
+
+    def __init__(self, prn: int):
+        self.prn = prn
+        self.ephemeris: np.void | None = None
+        self.iono_utc = np.zeros((), IONO_UTC)[()]
+        self.iono_utc_valid: set[str] = set()
+        self.ggto: tuple[float, float, float, int] | None = None
+        self.almanac: dict[int, dict[str, float]] = {}
+        self.health: int | None = None
+        self.svid: int | None = None
+        self.polarity = 0
+        self.synced = False
+        self.pages_ok = self.pages_failed = self.pages_alert = 0
+        self.words: dict[int, int] = {}
+        self._symbols = np.empty(0, np.float32)
+        self._index = 0  # of self._symbols[0]
+        self._missed = 0
+        self._phase: int | None = None  # confirmed: symbols since the start of the week at index 0
+        self._phase_candidate: int | None = None
+        self._week_anchor: tuple[int, int, int] | None = None  # (week, index of a symbol in it, phase)
+        self._set: dict[int, dict[str, float]] = {}
+        self._word_5: dict[str, float] | None = None
+        self._almanac_words: dict[int, dict[str, float]] = {}
+
+    @property
+    def healthy(self) -> bool | None:
+        """E1B_HS = 0 and E1B_DVS = 0; None before word 5."""
+        return None if self.health is None else self.health == 0
+
+    def tow_of(self, index: int) -> int | None:
+        """Transmit time of the start of symbol `index`, ms of week, GST; None until confirmed."""
+        if self._phase is None:
+            return None
+        return (self._phase + int(index)) % self.symbols_per_week * self.symbol_ms
+
+    def week_of(self, index: int) -> int | None:
+        """Continuous week in which symbol `index` was sent; None until time and week are known."""
+        if self._phase is None or self._week_anchor is None or self._week_anchor[2] != self._phase:
+            return None
+        week, anchor, _ = self._week_anchor
+        period = self.symbols_per_week
+        return week + (self._phase + int(index)) // period - (self._phase + anchor) // period
+
+    @property
+    def week(self) -> int | None:
+        """Continuous week of the last symbol fed."""
+        return self.week_of(self._index + self._symbols.size - 1)
+
+    def feed(self, symbols: np.ndarray, index0: int) -> list[tuple[str, int, int, bool]]:
+        """Take soft symbols (+ = logic 0) whose first one has running index `index0`.
+
+        A jump of the index is a loss of symbols: sync is sought afresh and time confirmed anew; decoded data
+        stay.
+
+        Returns
+        -------
+        List of ("page", word type, index of the first symbol of its even part, crc_ok); the type is -1 for a
+        page that failed and for an alert page.
+        """
+        new = np.asarray(symbols, np.float32)
+        if not np.isfinite(new).all():
+            raise ValueError(f"I/NAV symbols from index {index0} on hold NaN or infinity: feed finite values")
+        if index0 != self._index + self._symbols.size:
+            self._restart(int(index0))
+        self._symbols = np.concatenate((self._symbols, new))
+        events = []
+        while self._advance():
+            if self._symbols.size < PAGE_SYMBOLS:
+                break
+            events.append(self._page())
+        return events
+
+    def _restart(self, index0: int) -> None:
+        self._symbols, self._index = np.empty(0, np.float32), index0
+        self.synced, self.polarity, self._missed = False, 0, 0
+        if self._phase is not None:
+            self._phase_candidate, self._phase = self._phase, None
+
+    def _drop(self, n: int) -> None:
+        self._symbols, self._index = self._symbols[n:], self._index + n
+
+    def _advance(self) -> bool:
+        """Move to the start of a page; False if none is in sight."""
+        if self.synced:
+            return True
+        n = self._symbols.size - PAGE_SYMBOLS + 1
+        if n <= 0:
+            return False
+        signs = np.where(self._symbols < 0, -1, 1)
+        single = np.correlate(signs, SYNC_SIGNS.astype(np.int64), "valid")
+        double = single[:n] + single[PART_SYMBOLS : PART_SYMBOLS + n]
+        for first in np.flatnonzero(np.abs(double) >= 16):
+            even, _ = decode_part(self._symbols[first : first + PART_SYMBOLS])
+            odd, _ = decode_part(self._symbols[first + PART_SYMBOLS : first + PAGE_SYMBOLS])
+            if even[0] == 0 and odd[0] == 1 and page_word(even, odd)[1]:
+                self._drop(int(first))
+                self.synced, self._missed = True, 0
+                return True
+        self._drop(n)
+        return False
+
+    def _page(self) -> tuple[str, int, int, bool]:
+        index = self._index
+        even, _ = decode_part(self._symbols[:PART_SYMBOLS])
+        odd, polarity = decode_part(self._symbols[PART_SYMBOLS:PAGE_SYMBOLS])
+        self._drop(PAGE_SYMBOLS)
+        word, crc_ok = page_word(even, odd)
+        paired = even[0] == 0 and odd[0] == 1
+        if crc_ok and paired and even[1] == odd[1] == 0:
+            self.pages_ok, self._missed, self.polarity = self.pages_ok + 1, 0, polarity
+            number = word >> 122
+            self.words[number] = self.words.get(number, 0) + 1
+            self._take(number, word, index)
+            return "page", number, index, True
+        if paired and even[1] == odd[1] == 1:
+            self.pages_alert += 1
+        else:
+            self.pages_failed += 1
+        self._missed += 1
+        if self._missed >= self.lost_after:
+            self.synced = False
+        return "page", -1, index, False
+
+    def _take(self, number: int, word: int, index: int) -> None:
+        if number not in WORDS or number == 63:
+            return
+        values = unpack(WORDS[number], word, WORD_BITS)
+        if "gst_tow_s" in values and (number != 0 or values["time"] == 2):
+            self._take_time(values, index)
+        if 1 <= number <= 4:
+            if number == 4:
+                self.svid = int(values["prn"])
+                if self.svid != self.prn:
+                    return
+            self._set[number] = values
+            self._assemble(index)
+        elif number == 5:
+            self._take_word_5(values, index)
+        elif number == 6:
+            self._take_utc(values)
+        elif number >= 7:
+            self._take_almanac(number, values, word)
+
+    def _take_time(self, values: dict[str, float], index: int) -> None:
+        """Keep the time of a word: candidate first, confirmed when a second word says the same."""
+        if values["gst_tow_s"] >= SECONDS_PER_WEEK:
+            return
+        phase = (int(values["gst_tow_s"]) * PART_SYMBOLS - index) % self.symbols_per_week
+        if phase == self._phase_candidate:
+            self._phase = phase
+        self._phase_candidate = phase
+        if "gst_week" in values:
+            self._week_anchor = (int(values["gst_week"]) + GST_WEEK_0, index, phase)
+
+    def _assemble(self, index: int) -> None:
+        """Ephemeris from words 1 to 4 if they are of one IODnav, and word 5."""
+        if len(self._set) < 4 or self._word_5 is None or self._week_anchor is None:
+            return
+        if len({values["iode"] for values in self._set.values()}) > 1:
+            return
+        week, anchor, phase = self._week_anchor
+        time = phase + index
+        week += time // self.symbols_per_week - (phase + anchor) // self.symbols_per_week
+        tow_s = time % self.symbols_per_week * self.symbol_ms * 1e-3
+        record = np.zeros((), EPHEMERIS)[()]
+        for values in (*self._set.values(), self._word_5):
+            for name, value in values.items():
+                if name in EPHEMERIS.names:
+                    record[name] = value
+        record["system"], record["prn"], record["iodc"] = b"E", self.prn, record["iode"]
+        record["health"], record["tow_s"] = self.health, tow_s
+        record["week"] = week + round((tow_s - record["toe_s"]) / SECONDS_PER_WEEK)
+        if self.ephemeris is not None and self.ephemeris["iode"] == record["iode"]:
+            record["tow_s"] = self.ephemeris["tow_s"]  # of the first time the set was complete
+        self.ephemeris = record
+
+    def _take_word_5(self, values: dict[str, float], index: int) -> None:
+        self._word_5 = values
+        self.health = int(values["e1b_dvs"]) + 2 * int(values["e1b_hs"])
+        self.iono_utc["ai"] = values["ai0"], values["ai1"], values["ai2"]
+        self.iono_utc_valid.add("nequick")
+        self._assemble(index)
+
+    def _reference_week(self) -> int:
+        return self._week_anchor[0] if self._week_anchor else 2048 + 512
+
+    def _take_utc(self, values: dict[str, float]) -> None:
+        for name in ("a0_utc_s", "a1_utc_s_s", "tot_s", "dt_ls_s", "dn", "dt_lsf_s"):
+            self.iono_utc[name] = values[name]
+        self.iono_utc["week_t"] = nearest_week(values["week_t_256"], 256, self._reference_week())
+        self.iono_utc["week_lsf"] = nearest_week(values["week_lsf_256"], 256, self._reference_week())
+        self.iono_utc_valid.add("utc")
+
+    def _take_almanac(self, number: int, values: dict[str, float], word: int) -> None:
+        """Words 7 to 10 in this order with one IODa make three almanacs; word 10 holds GGTO."""
+        if number == 7:
+            self._almanac_words = {}
+        elif self._almanac_words.get(number - 1, {}).get("ioda") != values["ioda"]:
+            self._almanac_words = {}
+        if number == 7 or self._almanac_words:
+            self._almanac_words[number] = values
+        if number == 10:
+            self._take_ggto(values, word)
+            if len(self._almanac_words) == 4:
+                self._take_group({k: v for w in self._almanac_words.values() for k, v in w.items()})
+
+    def _take_ggto(self, values: dict[str, float], word: int) -> None:
+        if word & GGTO_ABSENT == GGTO_ABSENT:
+            self.ggto = None
+            self.iono_utc_valid.discard("ggto")
+            return
+        week = nearest_week((int(values["week_0g_64"]) + GST_WEEK_0) % 64, 64, self._reference_week())
+        for name in ("a0g_s", "a1g_s_s", "t0g_s"):
+            self.iono_utc[name] = values[name]
+        self.iono_utc["week_0g"] = week
+        self.ggto = (float(values["a0g_s"]), float(values["a1g_s_s"]), float(values["t0g_s"]), week)
+        self.iono_utc_valid.add("ggto")
+
+    def _take_group(self, values: dict[str, float]) -> None:
+        for k in (1, 2, 3):
+            svid = int(values[f"svid_{k}"])
+            if svid == 0:
+                continue
+            element = {name[:-2]: value for name, value in values.items() if name.endswith(f"_{k}")}
+            element["sqrt_a_sqrt_m"] = element.pop("delta_sqrt_a") + REFERENCE_SQRT_A
+            element["i0_rad"] = element.pop("delta_i_rad") + REFERENCE_INCLINATION_RAD
+            self.almanac[svid] = element | {"toa_s": values["toa_s"], "week_a_4": values["week_a_4"]}

@@ -1,7 +1,7 @@
 """GPS LNAV: the tables of the message, the encoder and the decoder side by side.
 
-Source: IS-GPS-200, 20.3 (fields: tables 20-I to 20-VI and figure 20-1; parity: 20.3.5.2). A subframe is an integer
-of 300 bits in which the six parity bits of each word are zero until `transmit` fills them.
+Source: IS-GPS-200, 20.3 (fields: tables 20-I to 20-VI and figure 20-1; parity: 20.3.5.2). A subframe is an
+integer of 300 bits in which the six parity bits of each word are zero until `transmit` fills them.
 """
 
 import numpy as np
@@ -17,7 +17,7 @@ SUBFRAME_BITS = 300
 SUBFRAMES_PER_WEEK = 100_800
 PREAMBLE = 0b10001011
 
-# --- tables -----------------------------------------------------------------------------------------------------
+# --- tables -------------------------------------------------------------------------------------------------
 
 HEADER = (
     integer("preamble", 1, 8),
@@ -129,7 +129,7 @@ REFERENCE_INCLINATION_RAD = 0.30 * GNSS_PI
 ALTERNATING = sum(0xAAAAAA << (6 + 30 * (9 - word)) for word in range(2, 10)) & ((1 << 232) - 1) & ~(3 << 6)
 """Alternating ones and zeros behind the SV ID of a dummy page (20.3.3.5.1.2)."""
 
-# --- parity -----------------------------------------------------------------------------------------------------
+# --- parity -------------------------------------------------------------------------------------------------
 
 PARITY_MASKS = (0x2EC7CD2, 0x1763E69, 0x2BB1F34, 0x15D8F9A, 0x1AEC7CD, 0x22DEA27)
 """Equations of D25..D30 over [D29* D30* d1..d24] (table 20-XIV)."""
@@ -195,7 +195,7 @@ def _check(bits, first, n_words, previous, data, good):
 
 @njit(cache=True, nogil=True)
 def _find(bits, start):
-    """First place from `start` on that reads like words 1 and 2 of a subframe, and its polarity; -1 if none."""
+    """First place from `start` that reads like words 1 and 2 of a subframe, and its polarity; -1 if none."""
     data = np.empty(2, np.int64)
     good = np.empty(2, np.bool_)
     for first in range(start, bits.size - 59):
@@ -217,7 +217,7 @@ def _find(bits, start):
     return -1, 0
 
 
-# --- encoder ----------------------------------------------------------------------------------------------------
+# --- encoder ------------------------------------------------------------------------------------------------
 
 
 def _values(record: np.void) -> dict[str, float]:
@@ -315,7 +315,8 @@ def _sorted_records(ephemeris: np.ndarray | np.void) -> np.ndarray:
     for record in records:
         if not record["iode"] == record["iodc"] & 0xFF:
             raise ValueError(
-                f"LNAV of G{record['prn']:02d}: IODE {record['iode']} must equal the low 8 bits of IODC {record['iodc']}"
+                f"LNAV of G{record['prn']:02d}: IODE {record['iode']} must equal the low 8 bits of "
+                f"IODC {record['iodc']}"
             )
     return records[np.lexsort((records["toe_s"], records["week"]))]
 
@@ -338,10 +339,11 @@ def encode(
 
     Parameters
     ----------
-    ephemeris : EPHEMERIS record, or array of records of this satellite; one of several comes into force on the first
-        frame at least two hours before its toe.
+    ephemeris : EPHEMERIS record, or array of records of this satellite; one of several comes into force on
+        the first frame at least two hours before its toe.
     iono_utc : IONO_UTC record for subframe 4 page 18, or None for a dummy page.
-    almanac : EPHEMERIS array, reduced to almanacs at the latest toe; others' pages are dummies. None: all dummies.
+    almanac : EPHEMERIS array, reduced to almanacs at the latest toe; others' pages are dummies. None: all
+        dummies.
     week, tow_s : continuous GPS week and whole second of the first bit.
     n_bits : number of 20 ms bits.
 
@@ -389,7 +391,7 @@ def quantised(ephemeris: np.void) -> np.void:
     return record
 
 
-# --- decoder ----------------------------------------------------------------------------------------------------
+# --- decoder ------------------------------------------------------------------------------------------------
 
 
 def nearest_week(truncated: int, modulus: int, week: int) -> int:
@@ -400,14 +402,16 @@ def nearest_week(truncated: int, modulus: int, week: int) -> int:
 class Decoder:
     """LNAV bits of one satellite to time, ephemeris, health and ionosphere.
 
-    Bits may be inverted as a whole (half cycle of the carrier): the preamble tells, and parity undoes it. A place is
-    accepted as the start of a subframe if preamble, parity of words 1 and 2, their trailing zeros and the agreement
-    of subframe number and TOW allow it (chance 1e-7 per bit); time counts once two headers agree on it.
+    Bits may be inverted as a whole (half cycle of the carrier): the preamble tells, and parity undoes it. A
+    place is accepted as the start of a subframe if preamble, parity of words 1 and 2, their trailing zeros
+    and the agreement of subframe number and TOW allow it (chance 1e-7 per bit); time counts once two headers
+    agree on it.
 
     Parameters
     ----------
     prn : satellite.
-    first_week : the ten bits of the week are resolved into first_week .. first_week + 1023 (2048 = 2019-04-07).
+    first_week : the ten bits of the week are resolved into first_week .. first_week + 1023 (2048 =
+        2019-04-07).
 
     Attributes
     ----------
@@ -442,7 +446,7 @@ class Decoder:
         self._missed = 0
         self._phase: int | None = None  # confirmed: symbols since the start of the week at index 0
         self._phase_candidate: int | None = None
-        self._week_anchor: tuple[int, int] | None = None  # (week, index of a symbol in it)
+        self._week_anchor: tuple[int, int, int] | None = None  # (week, index of a symbol in it, phase)
         self._subframes: dict[int, dict[str, float]] = {}
 
     @property
@@ -458,14 +462,11 @@ class Decoder:
 
     def week_of(self, index: int) -> int | None:
         """Continuous week in which bit `index` was sent; None until time and week are known."""
-        if self._phase is None or self._week_anchor is None:
+        if self._phase is None or self._week_anchor is None or self._week_anchor[2] != self._phase:
             return None
-        week, anchor = self._week_anchor
-        return (
-            week
-            + (self._phase + int(index)) // self.symbols_per_week
-            - (self._phase + anchor) // self.symbols_per_week
-        )
+        week, anchor, _ = self._week_anchor
+        period = self.symbols_per_week
+        return week + (self._phase + int(index)) // period - (self._phase + anchor) // period
 
     @property
     def week(self) -> int | None:
@@ -475,7 +476,8 @@ class Decoder:
     def feed(self, symbols: np.ndarray, index0: int) -> list[tuple[str, int, int, bool]]:
         """Take soft bits (+ = logic 0) whose first one has running index `index0`.
 
-        A jump of the index is a loss of bits: sync is sought afresh and time confirmed anew; decoded data stay.
+        A jump of the index is a loss of bits: sync is sought afresh and time confirmed anew; decoded data
+        stay.
 
         Returns
         -------
@@ -496,7 +498,8 @@ class Decoder:
     def _restart(self, index0: int) -> None:
         self._bits, self._index = np.empty(0, np.uint8), index0
         self.synced, self.polarity, self._missed = False, 0, 0
-        self._phase_candidate, self._phase = self._phase, None
+        if self._phase is not None:
+            self._phase_candidate, self._phase = self._phase, None
 
     def _drop(self, n: int) -> None:
         self._bits, self._index = self._bits[n:], self._index + n
@@ -540,7 +543,7 @@ class Decoder:
         return "subframe", number, index, ok
 
     def _accept_header(self, header: dict[str, float], index: int) -> bool:
-        """Check the header and keep its time: candidate first, confirmed when a second header says the same."""
+        """Check the header, keep its time: a candidate first, confirmed by a second header that agrees."""
         count = (int(header["tow_count"]) - 1) % SUBFRAMES_PER_WEEK
         if header["preamble"] != PREAMBLE or header["tow_count"] >= SUBFRAMES_PER_WEEK:
             return False
@@ -548,8 +551,6 @@ class Decoder:
             return False
         phase = (count * SUBFRAME_BITS - index) % self.symbols_per_week
         if phase == self._phase_candidate:
-            if self._phase is not None and phase != self._phase:
-                self._week_anchor = None
             self._phase = phase
         self._phase_candidate = phase
         self.alert = bool(header["alert"])
@@ -562,7 +563,7 @@ class Decoder:
             if number == 1:
                 self.health = int(values["health"])
                 week = self.first_week + (int(values["week_1024"]) - self.first_week) % 1024
-                self._week_anchor = (week, index)
+                self._week_anchor = (week, index, self._phase_candidate)
             self._assemble()
             return
         page = unpack(PAGE, message, SUBFRAME_BITS)
@@ -582,8 +583,7 @@ class Decoder:
         one, two, three = (self._subframes[k] for k in (1, 2, 3))
         if not int(one["iodc"]) & 0xFF == two["iode"] == three["iode"]:
             return
-        week, anchor = self._week_anchor
-        phase = self._phase_candidate if self._phase is None else self._phase
+        week, anchor, phase = self._week_anchor
         tow_s = (phase + anchor) % self.symbols_per_week * self.symbol_ms * 1e-3
         record = np.zeros((), EPHEMERIS)[()]
         for name, value in (one | two | three).items():
@@ -591,6 +591,8 @@ class Decoder:
                 record[name] = value
         record["system"], record["prn"], record["tow_s"] = b"G", self.prn, tow_s
         record["week"] = week + round((tow_s - record["toe_s"]) / SECONDS_PER_WEEK)
+        if self.ephemeris is not None and self.ephemeris["iodc"] == record["iodc"]:
+            record["tow_s"] = self.ephemeris["tow_s"]  # of the first time the set was complete
         self.ephemeris = record
 
     def _take_page_18(self, values: dict[str, float]) -> None:
