@@ -1,0 +1,299 @@
+"""The sky of a scenario: which satellites, and the delay of each at every reading of the receiver's clock."""
+
+from dataclasses import dataclass, field
+from datetime import datetime
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from signals.atmosphere import RELATIVE_HUMIDITY
+from signals.clock import Clock
+from signals.constants import C_MPS, F_L1_HZ
+from signals.geometry_kernels import propagate_kernel
+from signals.orbits import (
+    check_ephemeris,
+    default_iono_utc,
+    nominal_constellation,
+    orbit_coefficients,
+    seconds_from,
+)
+from signals.records import EPHEMERIS, PVT_TRUTH
+from signals.timescale import week_tow
+from signals.trajectory import Motion
+
+SIGNAL_SYSTEM = {"L1CA": "G", "E1": "E"}
+_MAX_PRN = {"L1CA": 63, "E1": 50}
+_FROZEN = ConfigDict(
+    frozen=True, extra="forbid", validate_by_name=True, validate_by_alias=True, serialize_by_alias=True
+)
+_SELECT_STEP_S = 30.0
+_SatId = Annotated[str, Field(pattern=r"^[GE]\d\d$")]
+
+
+class ScriptedSpec(BaseModel):
+    """A satellite without an orbit: constant Doppler and Doppler rate from a given delay.
+
+    delay = delay_s - (doppler t + doppler_rate t^2 / 2) / F_L1 (+ receiver clock), code and carrier alike.
+    """
+
+    model_config = _FROZEN
+    signal: Literal["L1CA", "E1"] = "L1CA"
+    prn: int = Field(ge=1, le=63)
+    delay_s: float = Field(default=0.075, ge=0.0, le=10.0)
+    doppler_hz: float = Field(default=0.0, ge=-50e3, le=50e3)
+    doppler_rate_hz_s: float = Field(default=0.0, ge=-2_000.0, le=2_000.0)
+    cn0_dbhz: float | None = Field(default=None, ge=0.0, le=80.0)
+    elevation_deg: float = Field(default=45.0, ge=0.0, le=90.0)
+    azimuth_deg: float = Field(default=0.0, ge=0.0, le=360.0)
+
+
+class SatelliteSpec(BaseModel):
+    """What differs for one satellite of the constellation."""
+
+    model_config = _FROZEN
+    system: Literal["G", "E"]
+    prn: int = Field(ge=1, le=63)
+    cn0_dbhz: float | None = Field(default=None, ge=0.0, le=80.0)
+    health: int | None = Field(default=None, ge=0, le=63)
+
+
+@dataclass(frozen=True)
+class Satellite:
+    """One row of `Propagation`."""
+
+    system: str
+    prn: int
+    signal: str
+    ephemeris: np.ndarray | None
+    """EPHEMERIS record of shape (), None for a scripted satellite."""
+    cn0_dbhz: float
+
+    @property
+    def name(self) -> str:
+        """Identifier such as G05 or E11."""
+        return f"{self.system}{self.prn:02d}"
+
+
+@dataclass(frozen=True)
+class Propagation:
+    """Truth of S satellites at m readings of the receiver clock; all arrays (S, m) float64 but ``visible``.
+
+    ``delay_s`` is reading minus satellite code time, so the pseudorange is c delay and the chips sent are
+    CHIP_RATE (t_r - delay); the carrier phase is -F_L1 phase_delay cycles. Rates are per second of reading.
+    """
+
+    delay_s: np.ndarray
+    delay_rate_s_s: np.ndarray
+    phase_delay_s: np.ndarray
+    phase_delay_rate_s_s: np.ndarray
+    elevation_rad: np.ndarray
+    azimuth_rad: np.ndarray
+    range_m: np.ndarray
+    cn0_dbhz: np.ndarray
+    visible: np.ndarray
+
+
+class SkySpec(BaseModel):
+    """Satellites, their orbits and powers, and the atmosphere of a scenario."""
+
+    model_config = _FROZEN
+    start_time: datetime = Field(default=datetime(2024, 3, 1, 12, 0, 0), alias="start")
+    source: Literal["nominal", "rinex", "none"] = "nominal"
+    path: str | None = None
+    signals: tuple[Literal["L1CA", "E1"], ...] = ("L1CA", "E1")
+    elevation_mask_deg: float = Field(default=5.0, ge=0.0, lt=90.0)
+    max_satellites: int | None = Field(default=None, ge=1, le=128)
+    prns: tuple[_SatId, ...] | None = None
+    unhealthy: tuple[_SatId, ...] = ()
+    cn0_dbhz: float = Field(default=45.0, ge=0.0, le=80.0)
+    cn0_model: Literal["constant", "elevation"] = "constant"
+    cn0_drop_db: float = Field(default=10.0, ge=0.0, le=40.0)
+    satellite: tuple[SatelliteSpec, ...] = ()
+    scripted: tuple[ScriptedSpec, ...] = ()
+    ionosphere: Literal["klobuchar", "none"] = "klobuchar"
+    troposphere: Literal["saastamoinen", "none"] = "saastamoinen"
+
+    @field_validator("start_time")
+    @classmethod
+    def _whole_second(cls, value: datetime) -> datetime:
+        week_tow(value)
+        return value
+
+    def start(self, motion: Motion, clock: Clock, duration_s: float) -> "Sky":
+        """Choose the satellites that rise above the mask within [0, duration_s] and make their `Sky`.
+
+        Raises
+        ------
+        ValueError
+            No satellite left, a satellite named that the source does not hold, or a PRN without a code.
+        """
+        week, tow_s = week_tow(self.start_time)
+        ephemerides, iono_utc = self._load(week, tow_s)
+        ephemerides = self._named(ephemerides)
+        check_ephemeris(ephemerides)
+        sky = Sky(self, motion, clock, week, tow_s, iono_utc, self._rows(ephemerides))
+        sky = sky.only(self._chosen(sky, duration_s))
+        if not sky.satellites:
+            raise ValueError(
+                f"no satellite of {', '.join(self.signals)} rises above {self.elevation_mask_deg:g} deg:"
+                " lower elevation_mask_deg, or allow more signals or prns"
+            )
+        return sky
+
+    def _load(self, week: int, tow_s: int) -> tuple[np.ndarray, np.ndarray]:
+        systems = sorted({SIGNAL_SYSTEM[s] for s in self.signals}, reverse=True)
+        if self.source == "none":
+            return np.zeros(0, EPHEMERIS), default_iono_utc(week, tow_s)
+        parts = [nominal_constellation(system, week, tow_s) for system in systems]
+        return np.concatenate(parts) if parts else np.zeros(0, EPHEMERIS), default_iono_utc(week, tow_s)
+
+    def _named(self, ephemerides: np.ndarray) -> np.ndarray:
+        """Keep ``prns``, apply the healths, refuse names that are not there."""
+        out = ephemerides.copy()
+        names = np.array([f"{e['system'].decode()}{e['prn']:02d}" for e in out], dtype="U3")
+        asked = [*(self.prns or ()), *self.unhealthy, *(f"{s.system}{s.prn:02d}" for s in self.satellite)]
+        for name in asked:
+            if name not in names:
+                raise ValueError(
+                    f"satellite {name} is not in the {self.source} sky at the start: leave it out"
+                )
+        for name in self.unhealthy:
+            out["health"][names == name] = 63 if name[0] == "G" else 2
+        for spec in self.satellite:
+            if spec.health is not None:
+                out["health"][names == f"{spec.system}{spec.prn:02d}"] = spec.health
+        return out if self.prns is None else out[np.isin(names, self.prns)]
+
+    def _rows(self, ephemerides: np.ndarray) -> tuple[Satellite, ...]:
+        own = {(s.system, s.prn): s.cn0_dbhz for s in self.satellite if s.cn0_dbhz is not None}
+        signal = {SIGNAL_SYSTEM[s]: s for s in self.signals}
+        rows = []
+        for eph in ephemerides:
+            system, prn = eph["system"].decode(), int(eph["prn"])
+            if not 1 <= prn <= _MAX_PRN[signal[system]]:
+                raise ValueError(
+                    f"PRN {prn} has no {signal[system]} code: allowed are 1 to {_MAX_PRN[signal[system]]}"
+                )
+            rows.append(
+                Satellite(system, prn, signal[system], eph.reshape(()), own.get((system, prn), self.cn0_dbhz))
+            )
+        for s in self.scripted:
+            if s.prn > _MAX_PRN[s.signal]:
+                raise ValueError(f"PRN {s.prn} has no {s.signal} code: allowed are 1 to {_MAX_PRN[s.signal]}")
+            cn0 = self.cn0_dbhz if s.cn0_dbhz is None else s.cn0_dbhz
+            rows.append(Satellite(SIGNAL_SYSTEM[s.signal], s.prn, s.signal, None, cn0))
+        names = [row.name for row in rows]
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f"satellite {name} appears twice: leave it out of prns or of scripted")
+        return tuple(rows)
+
+    def _chosen(self, sky: "Sky", duration_s: float) -> np.ndarray:
+        """Indices of the satellites seen at any time; the highest ones where ``max_satellites`` is set."""
+        t = np.linspace(0.0, duration_s, max(2, int(np.ceil(duration_s / _SELECT_STEP_S)) + 1))
+        highest = np.where(sky.propagate(t).visible, sky.propagate(t).elevation_rad, -np.inf).max(axis=1)
+        index = np.flatnonzero(highest > -np.inf)
+        if self.max_satellites is not None:
+            index = np.sort(index[np.argsort(-highest[index], kind="stable")[: self.max_satellites]])
+        return index
+
+
+@dataclass(frozen=True)
+class Sky:
+    """Run of a sky; `propagate` is a pure function, so any chunking gives the same bits."""
+
+    spec: SkySpec
+    motion: Motion
+    clock: Clock
+    week: int
+    tow_s: int
+    iono_utc: np.ndarray
+    """IONO_UTC record of shape (), one for both constellations."""
+    satellites: tuple[Satellite, ...]
+    _orbits: dict[str, Any] = field(init=False, repr=False)
+    _scripts: tuple[ScriptedSpec, ...] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        with_orbit = [s.ephemeris for s in self.satellites if s.ephemeris is not None]
+        eph = np.array(with_orbit, dtype=EPHEMERIS)
+        # GST - GPS: a Galileo satellite's clock is set to GST, which reads GPS time + GGTO.
+        ggto = np.where(eph["system"] == b"E", self.iono_utc["a0g_s"], 0.0)
+        orbits = {
+            "k": orbit_coefficients(eph) if eph.size else np.zeros((0, 19)),
+            "toe": seconds_from(eph, "toe_s", self.week, self.tow_s),
+            "toc": seconds_from(eph, "toc_s", self.week, self.tow_s),
+            "offset": eph["tgd_s"] - ggto,
+        }
+        object.__setattr__(self, "_orbits", orbits)
+        scripted = {(SIGNAL_SYSTEM[s.signal], s.prn): s for s in self.spec.scripted}
+        own = tuple(scripted[s.system, s.prn] for s in self.satellites if s.ephemeris is None)
+        object.__setattr__(self, "_scripts", own)
+
+    def only(self, index) -> "Sky":
+        """The same sky with the satellites of ``index`` alone."""
+        rows = tuple(self.satellites[i] for i in index)
+        return Sky(self.spec, self.motion, self.clock, self.week, self.tow_s, self.iono_utc, rows)
+
+    def propagate(self, t_s) -> Propagation:
+        """Delays at readings ``t_s`` (m,) of the receiver's clock, seconds since the start epoch.
+
+        delay = bias + rho / c + I + T - dt_sv + TGD - GGTO (phase_delay: -I): a receiver that applies the
+        broadcast clock, dt_sv - TGD, is left with none of it. rho is the light-time solution in the inertial
+        frame. Sagnac, clock, relativity included; < 1e-6 m numerically.
+        """
+        t_r = np.atleast_1d(np.asarray(t_s, float))
+        bias, drift = self.clock(t_r)
+        t = t_r - bias
+        out = np.concatenate([self._from_orbits(t), self._from_scripts(t)], axis=1)
+        delay, rate, iono, iono_rate, elevation, azimuth, range_m, _ = out
+        # True time runs at 1 - drift of the reading.
+        slow = 1.0 - drift
+        delay, rate, iono_rate = delay + bias, rate * slow + drift, iono_rate * slow
+        cn0 = self._cn0_dbhz(elevation)
+        visible = elevation >= np.radians(self.spec.elevation_mask_deg)
+        visible[self._orbits["k"].shape[0] :] = True
+        return Propagation(
+            delay, rate, delay - 2.0 * iono, rate - 2.0 * iono_rate, elevation, azimuth, range_m, cn0, visible
+        )
+
+    def receiver(self, t_s) -> np.ndarray:
+        """PVT_TRUTH (m,) at readings ``t_s`` of the receiver's clock; sample_index is left 0."""
+        t_r = np.atleast_1d(np.asarray(t_s, float))
+        bias, drift = self.clock(t_r)
+        state = self.motion(t_r - bias)
+        out = np.zeros(t_r.size, PVT_TRUTH)
+        out["t_s"], out["clock_bias_s"], out["clock_drift_s_s"] = t_r, bias, drift
+        out["pos_ecef_m"], out["vel_ecef_mps"] = state.pos_ecef_m, state.vel_ecef_mps
+        return out
+
+    def _from_orbits(self, t: np.ndarray) -> np.ndarray:
+        o, iono = self._orbits, self.iono_utc
+        out = np.zeros((8, o["k"].shape[0], t.size))
+        if out.size == 0:
+            return out
+        state = self.motion(t)
+        propagate_kernel(
+            o["k"], o["toe"], o["toc"], o["offset"], t,
+            np.ascontiguousarray(state.pos_ecef_m), np.ascontiguousarray(state.vel_ecef_mps), float(self.tow_s),
+            self.spec.ionosphere == "klobuchar",
+            np.array(iono["alpha"], dtype=float), np.array(iono["beta"], dtype=float),
+            self.spec.troposphere == "saastamoinen", RELATIVE_HUMIDITY, out,
+        )  # fmt: skip
+        return out
+
+    def _from_scripts(self, t: np.ndarray) -> np.ndarray:
+        out = np.zeros((8, len(self._scripts), t.size))
+        for row, s in enumerate(self._scripts):
+            out[0, row] = s.delay_s - t * (s.doppler_hz + 0.5 * t * s.doppler_rate_hz_s) / F_L1_HZ
+            out[1, row] = -(s.doppler_hz + t * s.doppler_rate_hz_s) / F_L1_HZ
+            out[4, row], out[5, row] = np.radians(s.elevation_deg), np.radians(s.azimuth_deg)
+            out[6, row] = C_MPS * out[0, row]
+        return out
+
+    def _cn0_dbhz(self, elevation: np.ndarray) -> np.ndarray:
+        """Constant, or falling from the zenith: cn0 - drop (1 - sin el)^2 (assumed antenna pattern)."""
+        level = np.array([s.cn0_dbhz for s in self.satellites])[:, None]
+        if self.spec.cn0_model == "constant":
+            return np.broadcast_to(level, elevation.shape).copy()
+        return level - self.spec.cn0_drop_db * (1.0 - np.sin(np.maximum(elevation, 0.0))) ** 2
