@@ -1,0 +1,231 @@
+"""The command line, ``gnssbb``.
+
+Nothing heavy is imported here: each command imports what it needs, so that ``--help`` answers at once.
+"""
+
+import json as jsonlib
+import os
+import signal
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from cyclopts import App, CycloptsError, Parameter
+
+from sdr import SCHEMA_VERSION, version
+
+app = App(
+    name="gnssbb",
+    version=version,
+    help="GNSS baseband simulator and software receiver: IF samples in or made, tracking, position, monitors.",
+    help_format="plaintext",
+)
+
+Json = Annotated[bool, Parameter(name="--json", negative="", help="Print one JSON object on stdout and nothing else.")]
+Out = Annotated[Path | None, Parameter(name=["--output", "-o"], help="Results file (HDF5).")]
+Set = Annotated[
+    list[str],
+    Parameter(name="--set", negative="", help="Override a scenario key, e.g. --set receiver.tracking.dll_bw_hz=1"),
+]
+Threads = Annotated[int, Parameter(help="Worker threads; the results do not depend on it.")]
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class Recording:
+    """How a file of IF samples is to be read; what SigMF or .tag metadata say needs no option."""
+
+    format: Annotated[str | None, Parameter(help="ci8 ci16 cf32 ri8 ri16 rf32 ci1 ci2 ri1 ri2, or a receiver's own name for it.")] = None
+    fs_hz: Annotated[float | None, Parameter(help="Sample rate in Hz.")] = None
+    if_hz: Annotated[float | None, Parameter(help="Intermediate frequency in Hz.")] = None
+    conjugate: Annotated[bool, Parameter(negative="", help="The spectrum is inverted: conjugate the samples.")] = False
+    skip_s: Annotated[float, Parameter(help="Leave out the first seconds.")] = 0.0
+    duration_s: Annotated[float | None, Parameter(help="Use this many seconds.")] = None
+
+
+@app.command
+def run(
+    scenario: str,
+    /,
+    *,
+    output: Out = None,
+    plots: Annotated[bool, Parameter(negative="", help="Draw the figures beside the results.")] = False,
+    json: Json = False,
+    set_: Set = [],  # noqa: B006
+    threads: Threads = 1,
+) -> None:
+    """Synthesise a scenario and receive it in one stream; no IF file is needed.
+
+    SCENARIO is a TOML file or the name of a built-in one (see: gnssbb scenarios).
+    """
+    from sdr import jobs
+
+    _report("run", jobs.run(scenario, output=output, overrides=set_, threads=threads, plots=plots, quiet=json), json)
+
+
+@app.command
+def simulate(
+    scenario: str,
+    /,
+    *,
+    output: Annotated[Path, Parameter(name=["--output", "-o"], help="Recording to write (base name).")],
+    json: Json = False,
+    set_: Set = [],  # noqa: B006
+    threads: Threads = 1,
+) -> None:
+    """Write a scenario's IF samples as a recording with metadata, and the truth in HDF5 beside it."""
+    from sdr import jobs
+
+    _report("simulate", jobs.simulate(scenario, output, overrides=set_, threads=threads, quiet=json), json)
+
+
+@app.command
+def receive(
+    file: Path,
+    /,
+    *,
+    recording: Recording = Recording(),  # noqa: B008
+    scenario: Annotated[str | None, Parameter(help="Scenario whose [receiver] section is used.")] = None,
+    output: Out = None,
+    plots: Annotated[bool, Parameter(negative="", help="Draw the figures beside the results.")] = False,
+    json: Json = False,
+    set_: Set = [],  # noqa: B006
+    threads: Threads = 1,
+) -> None:
+    """Receive a recording: acquire, track, decode and fix the position."""
+    from sdr import jobs
+
+    result = jobs.receive(
+        file, recording, scenario, output=output, overrides=set_, threads=threads, plots=plots, quiet=json
+    )
+    _report("receive", result, json)
+
+
+@app.command
+def acquire(
+    file: Path,
+    /,
+    *,
+    recording: Recording = Recording(),  # noqa: B008
+    signals: Annotated[list[str], Parameter(help="Signals to search: L1CA, E1C.")] = ["L1CA", "E1C"],  # noqa: B006
+    doppler_hz: Annotated[float | None, Parameter(help="Search Doppler from minus to plus this.")] = None,
+    p_fa: Annotated[float | None, Parameter(help="False-alarm probability over one satellite's whole search.")] = None,
+    json: Json = False,
+) -> None:
+    """Search a recording for satellites."""
+    from sdr import jobs
+
+    _report("acquire", jobs.acquire(file, recording, signals, doppler_hz, p_fa), json)
+
+
+@app.command
+def probe(
+    file: Path,
+    /,
+    *,
+    recording: Recording = Recording(),  # noqa: B008
+    plots: Annotated[Path | None, Parameter(help="Write the spectrum and level figures into this directory.")] = None,
+    json: Json = False,
+) -> None:
+    """Show what a stranger's recording is, and which declaration of it is consistent."""
+    from sdr import probe as prober
+
+    _report("probe", prober.probe(file, recording, plots), json)
+
+
+@app.command
+def plot(
+    results: Path,
+    /,
+    *,
+    output: Annotated[Path | None, Parameter(name=["--output", "-o"], help="Directory for the figures.")] = None,
+    json: Json = False,
+) -> None:
+    """Draw the figures of a results file."""
+    from sdr import plot as plotter
+
+    _report("plot", {"figures": [str(p) for p in plotter.plot(results, output)]}, json)
+
+
+@app.command
+def lines(
+    *,
+    signal: Annotated[str | None, Parameter(help="L1CA, E1B or E1C; all if not given.")] = None,
+    waveform: Annotated[str | None, Parameter(help="BPSK, BOC11, CBOC+ or CBOC-; all that fit if not given.")] = None,
+    prn: Annotated[int | None, Parameter(help="One PRN; all if not given.")] = None,
+    top: Annotated[int, Parameter(help="Lines to list per signal and waveform, or for one PRN.")] = 5,
+    tiered: Annotated[bool, Parameter(negative="", help="E1-C with its secondary code (100 ms period).")] = False,
+    plots: Annotated[Path | None, Parameter(help="Write the figures into this directory.")] = None,
+    json: Json = False,
+) -> None:
+    """List the strongest code spectrum lines: where a CW jammer hurts most."""
+    from sdr import lines as liner
+
+    _report("lines", liner.lines(signal, waveform, prn, top, tiered, plots), json)
+
+
+@app.command
+def bench(*, json: Json = False, quick: Annotated[bool, Parameter(negative="", help="Shorter, noisier.")] = False) -> None:
+    """Measure the speed of this machine's receiver and generator, as ratios to a plain kernel in the same run."""
+    from sdr import bench as bencher
+
+    _report("bench", bencher.bench(quick=quick, quiet=json), json)
+
+
+@app.command
+def scenarios(*, json: Json = False) -> None:
+    """List the built-in scenarios."""
+    from sdr import scenario
+
+    table = [{"name": n, "description": scenario.load(n)[0].description} for n in scenario.built_in()]
+    _report("scenarios", {"scenarios": table, "text": "\n".join(f"{r['name']:24} {r['description']}" for r in table)}, json)
+
+
+def _report(command: str, result: dict[str, Any], as_json: bool) -> None:
+    """Print a job's result: its ``text`` for people, everything else for machines."""
+    text = result.pop("text", None)
+    if as_json:
+        head = {"command": command, "version": version(), "schema": SCHEMA_VERSION}
+        print(jsonlib.dumps(head | result, allow_nan=False, default=_plain))
+    else:
+        print(text if text is not None else jsonlib.dumps(result, indent=2, default=_plain))
+
+
+def _plain(value: Any) -> Any:
+    """Numpy scalars and arrays, bytes and paths as JSON knows them."""
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    if isinstance(value, bytes):
+        return value.decode()
+    return str(value)
+
+
+def main() -> None:
+    """Entry point: run a command; bad input is one sentence and exit code 2, an interrupt is 130."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        app(exit_on_error=False, print_error=False)
+    except CycloptsError as err:
+        _fail(" ".join(str(err).split()))
+    except KeyboardInterrupt:
+        print("gnssbb: interrupted", file=sys.stderr)
+        sys.exit(130)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(0)
+    except (ValueError, OSError, ImportError) as err:
+        if "GNSSBB_DEBUG" in os.environ:
+            raise
+        _fail(str(err))
+    except MemoryError:
+        _fail("not enough memory; use a shorter duration or a lower sample rate")
+
+
+def _fail(sentence: str) -> None:
+    print(f"gnssbb: {sentence}", file=sys.stderr)
+    sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()

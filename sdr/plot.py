@@ -1,0 +1,211 @@
+"""Figures of a results file: tracking errors, C/N0, I/Q, correlation function, sky and position."""
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from sdr import store
+from sdr.errors import position_errors, satellite_truth, tracking_errors
+
+SIZE_IN = (9.0, 5.0)
+
+
+@contextlib.contextmanager
+def figure(path: Path, title: str, rows: int = 1, projection: str | None = None, size: tuple[float, float] = SIZE_IN) -> Iterator[Any]:
+    """A figure of ``rows`` axes sharing x, saved to ``path`` and closed on leaving."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    fig = Figure(figsize=size, layout="constrained")
+    FigureCanvasAgg(fig)
+    axes = fig.subplots(rows, 1, sharex=rows > 1, subplot_kw={"projection": projection} if projection else None)
+    fig.suptitle(title)
+    for ax in np.atleast_1d(axes):
+        ax.grid(alpha=0.3)
+    yield axes
+    fig.savefig(path, dpi=130)
+
+
+def plot(results: Path, directory: Path | None = None) -> list[Path]:
+    """Draw every figure that ``results`` has data for; returns their paths."""
+    directory = directory or Path(results).with_suffix("")
+    with store.read(results) as h5:
+        directory.mkdir(parents=True, exist_ok=True)
+        channels = _channels(h5)
+        drawn = []
+        for draw in (_tracking_errors, _cn0, _iq, _correlation, _sky, _position):
+            path = draw(h5, channels, directory)
+            if path is not None:
+                drawn.append(path)
+    if not drawn:
+        raise ValueError(f"'{results}' has nothing to draw: no satellite was tracked")
+    return drawn
+
+
+def _channels(h5: h5py.File) -> dict[str, h5py.Group]:
+    return {n: g for n, g in h5.get("tracking", {}).items() if len(g["epochs"])}
+
+
+def _label(group: h5py.Group) -> str:
+    system = {"L1CA": "G", "E1B": "E", "E1C": "E"}[group["epochs"].attrs["signal"]]
+    return f"{system}{group['epochs'].attrs['prn']:02d}"
+
+
+def _tracking_errors(h5: h5py.File, channels: dict[str, h5py.Group], directory: Path) -> Path | None:
+    with_truth = {}
+    for name, group in channels.items():
+        attrs = group["epochs"].attrs
+        truth = satellite_truth(h5, b"G" if attrs["signal"] == "L1CA" else b"E", attrs["prn"])
+        if len(truth) > 1:
+            with_truth[name] = tracking_errors(group["epochs"][:], truth, attrs["fs_hz"], attrs["signal"])
+    if not with_truth:
+        return None
+    path = directory / "tracking_errors.png"
+    keys = {
+        "code_m": "code (m)",
+        "phase_cycles": "phase (cycle)",
+        "doppler_hz": "Doppler (Hz)",
+        "code_minus_carrier_m": "code − carrier (m)",
+    }
+    with figure(path, "Tracking errors: replica minus truth", rows=4, size=(9, 10)) as axes:
+        for name, errors in with_truth.items():
+            group = channels[name]
+            settled = errors["t_s"] > errors["t_s"][0] + 2.0 if len(errors["t_s"]) else slice(None)
+            for ax, key in zip(axes, keys):
+                ax.plot(errors["t_s"][settled], errors[key][settled], lw=0.6, label=_label(group))
+        for ax, (key, label) in zip(axes, keys.items()):
+            _theory_band(ax, key, channels)
+            ax.set_ylabel(label)
+            span = np.concatenate([e[key][len(e[key]) // 4 :] for e in with_truth.values()])
+            limit = 1.3 * float(np.quantile(np.abs(span), 0.999)) if span.size else 1.0
+            ax.set_ylim(-limit or -1, limit or 1)
+        axes[-1].set_xlabel("time (s)")
+        axes[0].legend(ncol=10, fontsize=7, loc="upper right")
+    return path
+
+
+def _theory_band(ax: Any, key: str, channels: dict[str, h5py.Group]) -> None:
+    attr = {"code_m": "code_sigma_m", "phase_cycles": "phase_sigma_cycles"}.get(key)
+    sigmas = [float(g["epochs"].attrs[attr]) for g in channels.values() if attr and attr in g["epochs"].attrs]
+    if sigmas:
+        sigma = float(np.median(sigmas))
+        ax.axhspan(-sigma, sigma, color="0.5", alpha=0.2, label="thermal ±1σ")
+
+
+def _cn0(h5: h5py.File, channels: dict[str, h5py.Group], directory: Path) -> Path | None:
+    if not channels:
+        return None
+    path = directory / "cn0.png"
+    with figure(path, "Carrier-to-noise density") as ax:
+        for group in channels.values():
+            e = group["epochs"]
+            ax.plot(e["sample_index"] / e.attrs["fs_hz"], e["cn0_dbhz"], lw=0.8, label=_label(group))
+        ax.set(xlabel="time (s)", ylabel="C/N0 (dB-Hz)")
+        ax.legend(ncol=8, fontsize=7)
+    return path
+
+
+def _iq(h5: h5py.File, channels: dict[str, h5py.Group], directory: Path) -> Path | None:
+    if not channels:
+        return None
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    path = directory / "iq.png"
+    columns = min(4, len(channels))
+    rows = -(-len(channels) // columns)
+    fig = Figure(figsize=(2.4 * columns, 2.5 * rows), layout="constrained")
+    FigureCanvasAgg(fig)
+    fig.suptitle("Prompt correlator, last 2000 integrations (ADC levels)")
+    for k, group in enumerate(channels.values()):
+        ax = fig.add_subplot(rows, columns, k + 1)
+        e = group["epochs"][-2000:]
+        ax.plot(e["prompt_i"], e["prompt_q"], ".", ms=1.5, alpha=0.4)
+        limit = 1.1 * float(max(np.abs(e["prompt_i"]).max(), np.abs(e["prompt_q"]).max(), 1e-9))
+        ax.set(xlim=(-limit, limit), ylim=(-limit, limit), aspect="equal", title=_label(group))
+        ax.tick_params(labelsize=6)
+        ax.grid(alpha=0.3)
+    fig.savefig(path, dpi=130)
+    return path
+
+
+def _correlation(h5: h5py.File, channels: dict[str, h5py.Group], directory: Path) -> Path | None:
+    grouped = {n: g for n, g in channels.items() if "corr" in g and g["corr"].shape[1] >= 3}
+    if not grouped:
+        return None
+    from signals.modulation import chip_acf
+
+    path = directory / "correlation.png"
+    with figure(path, "Correlation function across the taps, last second") as ax:
+        for group in grouped.values():
+            corr, taps = group["corr"][-50:], group["corr"].attrs["taps_chips"]
+            prompt = int(np.argmin(np.abs(taps)))
+            aligned = np.mean(corr * np.exp(-1j * np.angle(corr[:, prompt : prompt + 1])), axis=0).real
+            order = np.argsort(taps)
+            ax.plot(taps[order], aligned[order] / aligned[prompt], ".-", ms=4, lw=0.8, label=_label(group))
+        attrs = next(iter(grouped.values()))["corr"].attrs
+        d = np.linspace(-1.5, 1.5, 601)
+        ax.plot(d, chip_acf(d, attrs["waveform"], attrs["waveform"]), "k", lw=0.8, alpha=0.5, label="ideal")
+        ax.set(xlabel="tap offset (chip, early positive)", ylabel="amplitude re prompt")
+        ax.legend(ncol=6, fontsize=7)
+    return path
+
+
+def _sky(h5: h5py.File, channels: dict[str, h5py.Group], directory: Path) -> Path | None:
+    if "truth/satellites" not in h5 and "navigation/satellites" not in h5:
+        return None
+    rows = h5["truth/satellites" if "truth/satellites" in h5 else "navigation/satellites"][:]
+    rows = rows[rows["elevation_rad"] > 0]
+    if not len(rows):
+        return None
+    tracked = {_label(g) for g in channels.values()}
+    path = directory / "sky.png"
+    with figure(path, "Sky", projection="polar", size=(6, 6)) as ax:
+        ax.set_theta_zero_location("N")
+        ax.set_theta_direction(-1)
+        for system, prn in sorted({(r["system"], r["prn"]) for r in rows}):
+            one = rows[(rows["system"] == system) & (rows["prn"] == prn)]
+            name = f"{system.decode()}{prn:02d}"
+            zenith_deg = 90 - np.degrees(one["elevation_rad"])
+            color = {b"G": "C0", b"E": "C1"}[system] if name in tracked else "0.6"
+            ax.plot(one["azimuth_rad"], zenith_deg, color=color, lw=1)
+            ax.plot(one["azimuth_rad"][-1], zenith_deg[-1], "o", color=color)
+            ax.annotate(name, (one["azimuth_rad"][-1], zenith_deg[-1]), xytext=(5, 5), textcoords="offset points", fontsize=8)
+        ax.set_rlim(0, 90)
+        ax.set_rticks([15, 30, 45, 60, 75], labels=["75°", "60°", "45°", "30°", "15°"], fontsize=6)
+    return path
+
+
+def _position(h5: h5py.File, channels: dict[str, h5py.Group], directory: Path) -> Path | None:
+    if "navigation/solution" not in h5:
+        return None
+    solution = h5["navigation/solution"][:]
+    solution = solution[solution["valid"]]
+    if not len(solution):
+        return None
+    path = directory / "position.png"
+    fs_hz = h5["navigation/solution"].attrs["fs_hz"]
+    truth = h5["truth/receiver"][:] if "truth/receiver" in h5 else None
+    from signals.geodesy import ecef_to_geodetic, ned_matrix
+
+    if truth is not None:
+        enu, title = position_errors(solution, truth, fs_hz), "Position error against truth"
+    else:
+        mean = solution["pos_ecef_m"].mean(axis=0)
+        lat_rad, lon_rad, _ = ecef_to_geodetic(mean[None])
+        enu = ((solution["pos_ecef_m"] - mean) @ ned_matrix(lat_rad[0], lon_rad[0]).T)[:, [1, 0, 2]] * [1, 1, -1]
+        title = "Position about its mean"
+    with figure(path, title, rows=2, size=(9, 7)) as (ax, ax_n):
+        for k, name in enumerate(("east", "north", "up")):
+            ax.plot(solution["t_s"], enu[:, k], lw=0.9, label=f"{name}, rms {np.sqrt(np.mean(enu[:, k] ** 2)):.2f} m")
+        ax.set_ylabel("m")
+        ax.legend(fontsize=8)
+        ax_n.step(solution["t_s"], solution["n_used"], where="post", label="satellites used")
+        ax_n.plot(solution["t_s"], solution["pdop"], label="PDOP")
+        ax_n.set_xlabel("time (s)")
+        ax_n.legend(fontsize=8)
+    return path

@@ -1,0 +1,127 @@
+"""The scenario: one typed TOML file that says what is in the air, what the receiver does and what is watched.
+
+A scenario is the union of the Specs that the packages own; there is no second schema. A misspelt, missing or
+out-of-range key is refused with the key, the value and what is allowed.
+"""
+
+import tomllib
+from importlib.resources import files
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from nav.navigator import NavigationSpec
+from signals.clock import ClockSpec
+from signals.frontend import FrontEndSpec
+from signals.sky import SkySpec
+from signals.trajectory import MotionSpec, Static
+from tracking.acquisition import AcquisitionSpec
+from tracking.channel import TrackingSpec
+
+T = TypeVar("T", bound=BaseModel)
+SCHEMA = 1
+MAX_SCENARIO_BYTES = 1 << 20
+
+
+class ReceiverSpec(BaseModel):
+    """Section ``[receiver]``: everything between the samples and the position."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    acquisition: AcquisitionSpec = AcquisitionSpec()
+    tracking: TrackingSpec = TrackingSpec()
+    navigation: NavigationSpec = NavigationSpec()
+    slab_ms: Annotated[int, Field(ge=20, le=200, multiple_of=20)] = 100
+    """Length of the slab of samples that passes through the loop at once."""
+    search_every_s: Annotated[float, Field(gt=0)] = 5.0
+    """Satellites not yet tracked are searched again this often."""
+
+
+class Scenario(BaseModel):
+    """A whole scenario file."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    schema_: Annotated[int, Field(alias="schema", ge=SCHEMA, le=SCHEMA)] = SCHEMA
+    name: Annotated[str, Field(min_length=1, max_length=100)]
+    description: str = ""
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = 1
+    duration_s: Annotated[float, Field(gt=0, le=86_400)]
+    sky: SkySpec = SkySpec()
+    motion: Annotated[MotionSpec, Field(discriminator="kind")] = Static()
+    clock: ClockSpec = ClockSpec()
+    front_end: FrontEndSpec = FrontEndSpec()
+    receiver: ReceiverSpec = ReceiverSpec()
+
+
+def built_in() -> list[str]:
+    """Names of the scenarios that come with the package."""
+    return sorted(p.name.removesuffix(".toml") for p in (files("sdr") / "scenarios").iterdir() if p.name.endswith(".toml"))
+
+
+def load(name_or_path: str) -> tuple[Scenario, str]:
+    """Read a scenario by built-in name or by path; return it with its text.
+
+    Raises ValueError with one sentence for anything that is not a valid scenario.
+    """
+    path = Path(name_or_path)
+    if path.suffix != ".toml" and name_or_path in built_in():
+        text = (files("sdr") / "scenarios" / f"{name_or_path}.toml").read_text(encoding="utf-8")
+        return parse(text, name_or_path), text
+    if not path.is_file():
+        raise ValueError(
+            f"scenario '{name_or_path}' is neither a file nor a built-in name; built in are: {', '.join(built_in())}"
+        )
+    if path.stat().st_size > MAX_SCENARIO_BYTES:
+        raise ValueError(f"scenario '{path}' is larger than {MAX_SCENARIO_BYTES} bytes; a scenario is a short TOML text")
+    try:
+        text = path.read_text(encoding="utf-8")
+    except UnicodeDecodeError:
+        raise ValueError(f"scenario '{path}' is not UTF-8 text; a scenario is a TOML file") from None
+    return parse(text, str(path)), text
+
+
+def parse(text: str, origin: str = "scenario") -> Scenario:
+    """Build a :class:`Scenario` from TOML text; ``origin`` names it in errors."""
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as err:
+        raise ValueError(f"{origin} is not valid TOML: {err}") from None
+    return validate(Scenario, table, origin)
+
+
+def validate(model: type[T], table: dict[str, Any], origin: str) -> T:
+    """Validate ``table`` as ``model``, with pydantic's report turned into one sentence."""
+    try:
+        return model.model_validate(table)
+    except ValidationError as err:
+        raise ValueError(f"{origin}: {_sentence(model, err)}") from None
+
+
+def _sentence(model: type[BaseModel], err: ValidationError) -> str:
+    first, *rest = err.errors(include_url=False)
+    keys = [str(k) for k in first["loc"]]
+    where = ".".join(keys) or "the file"
+    message = first["msg"].removeprefix("Value error, ")
+    if first["type"] == "extra_forbidden":
+        allowed = _allowed_keys(model, first["loc"][:-1])
+        text = f"'{where}' is not a known key" + (f"; allowed there: {', '.join(allowed)}" if allowed else "")
+    elif first["type"] == "missing":
+        text = f"'{where}' is missing; it has no default"
+    else:
+        value = first.get("input")
+        shown = f" = {value!r}" if isinstance(value, str | int | float | bool) else ""
+        text = f"'{where}'{shown}: {message[0].lower() + message[1:]}"
+    return text + (f" (and {len(rest)} more such error{'s' * (len(rest) > 1)})" if rest else "")
+
+
+def _allowed_keys(model: type[BaseModel], loc: tuple[Any, ...]) -> list[str]:
+    """Keys of the section at ``loc``, as far as the path leads through plain nested models."""
+    current: Any = model
+    for key in loc:
+        field = getattr(current, "model_fields", {}).get(str(key))
+        if field is None:
+            return []
+        current = field.annotation
+    return sorted(f.alias or n for n, f in getattr(current, "model_fields", {}).items())
