@@ -1,11 +1,12 @@
 """Echoes of the direct signal: an aeronautical channel and a plain list, both stateless in time.
 
-An echo with gain g(t) and excess delay tau(t) >= 0 adds ``g(t) s(t - tau(t))`` to the direct signal s(t), with the
-direct signal's own carrier phase: all its extra phase is in g(t), so tau(t) moves the code only. In a correlator
-whose replica is advanced by d the echo is g R(d + tau).
+An echo with gain g(t) and excess delay tau(t) >= 0 adds ``g(t) s(t - tau(t))`` to the direct signal s(t),
+with the direct signal's own carrier phase: all its extra phase is in g(t), so tau(t) moves the code only. In
+a correlator whose replica is advanced by d the echo is g R(d + tau).
 
-Unit-power fading n(t) with a flat spectrum inside +-B/2 is a sum of sinusoids (Steingass, Lehner et al., PLANS
-2004: h(t, tau) = 1 + sum_i sqrt(P_i) n_i(t) delta(tau - tau_i)), so that any instant can be evaluated alone.
+Unit-power fading n(t) with a flat spectrum inside +-B/2 is a sum of sinusoids (Steingass, Lehner et al.,
+PLANS 2004: h(t, tau) = 1 + sum_i sqrt(P_i) n_i(t) delta(tau - tau_i)), so that any instant can be evaluated
+alone.
 """
 
 import math
@@ -43,7 +44,9 @@ def echo_gain(t_s, amplitude, doppler_hz, tone_hz, tone_cycles):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def echo_series(t0_s, step_s, amplitude, doppler_hz, tone_hz, tone_cycles, out):
-    """``echo_gain`` at t0 + i step of every echo; ``out`` complex64 (n_echo, n), tones float64 (n_echo, M)."""
+    """``echo_gain`` at t0 + i step of every echo; ``out`` complex64 (n_echo, n), tones float64 (n_echo,
+    M).
+    """
     n = out.shape[1]
     total = np.empty(n, np.complex128)
     for k in range(out.shape[0]):
@@ -68,7 +71,9 @@ class _Spec(BaseModel):
 
 
 class Echo(_Spec):
-    """One echo of a list: excess delay at t = 0 and its rate, power, Doppler and phase against the direct signal."""
+    """One echo of a list: excess delay at t = 0 and its rate, power, Doppler and phase against the direct
+    signal.
+    """
 
     delay_s: float = Field(ge=0, le=1e-3)
     delay_rate_s_s: float = Field(0.0, ge=-1e-5, le=1e-5)
@@ -92,9 +97,9 @@ class Echoes(_Spec):
 class Aeronautical(_Spec):
     """Aircraft on approach: fuselage echo, optional refracted component, ground echo.
 
-    Sourced: h(t, tau) above; a fuselage echo of -14.2 dB, 1 to 2 ns late; elevation 10 degrees (Ouzeau et al. 2008,
-    section VI; Steingass et al. 2004). Assumed, hence settings: every other value. Ground: tau = 2 h sin(E) / c,
-    Doppler = +2 v sin(E) / lambda while sinking (the excess path shortens).
+    Sourced: h(t, tau) above; a fuselage echo of -14.2 dB, 1 to 2 ns late; elevation 10 degrees (Ouzeau et al.
+    2008, section VI; Steingass et al. 2004). Assumed, hence settings: every other value. Ground: tau = 2 h
+    sin(E) / c, Doppler = +2 v sin(E) / lambda while sinking (the excess path shortens).
     """
 
     kind: Literal["Aeronautical"] = "Aeronautical"
