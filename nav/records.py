@@ -1,10 +1,28 @@
 """Structured arrays that leave this package.
 
-Signs: innovation = measured - predicted; error state = true - estimate; u = unit vector receiver -> satellite.
-Frames are in the names: ecef, ned; ``C_bn`` rotates body (forward, right, down) into north-east-down.
+Signs: innovation = measured - predicted; error state = true - estimate; u = unit vector receiver ->
+satellite. Frames are in the names: ecef, ned; ``C_bn`` rotates body (forward, right, down) into
+north-east-down.
 """
 
 import numpy as np
+
+TRANSMIT = np.dtype(
+    [
+        ("sample_index", "u8"),  # the same for all rows of one epoch
+        ("system", "S1"),  # b"G" or b"E"
+        ("signal", "S4"),
+        ("prn", "i4"),
+        ("tow_tx_ms", "i8"),  # whole ms of the transmit time of week at sample_index; -1: not decoded yet
+        ("tow_tx_frac_s", "f8"),  # remainder, in [0, 1e-3)
+        ("doppler_hz", "f8"),
+        ("carrier_phase_cycles", "f8"),  # grows with positive Doppler
+        ("cn0_dbhz", "f8"),
+        ("lock_s", "f8"),  # time since the phase was last lost
+        ("cycle_slip", "?"),  # since the previous epoch
+    ]
+)
+"""What tracking and telemetry know of one channel at a common receiver sample."""
 
 OBSERVATION = np.dtype(
     [
@@ -25,6 +43,23 @@ OBSERVATION = np.dtype(
     ]
 )
 """One satellite at a common receiver sample."""
+
+SATELLITE = np.dtype(
+    [
+        ("system", "S1"),
+        ("prn", "i4"),
+        ("pos_ecef_m", "f8", 3),  # at transmission, in the Earth-fixed frame of that instant
+        ("vel_ecef_mps", "f8", 3),
+        ("clock_m", "f8"),  # c x (dt_SV - TGD or BGD), relativity included
+        ("clock_rate_mps", "f8"),
+        ("azimuth_rad", "f8"),
+        ("elevation_rad", "f8"),
+        ("iono_m", "f8"),
+        ("tropo_m", "f8"),
+        ("atmosphere_rate_mps", "f8"),  # what the carrier sees: d(tropo - iono)/dt
+    ]
+)
+"""A satellite at transmission and, once a position is known, as seen from it; row i = observation i."""
 
 SOLUTION = np.dtype(
     [
