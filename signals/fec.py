@@ -10,7 +10,7 @@ from numba import njit
 CRC24Q = 0x1864CFB
 """Generator of CRC-24Q (Galileo OS SIS ICD, 5.1.9.4; Qualcomm): initial value 0, no reflection."""
 G1, G2 = 0o171, 0o133
-"""Generators of the rate 1/2, K = 7 code, newest bit = leftmost tap; G2's output is inverted (ICD, 4.1.4.1)."""
+"""Generators of the rate 1/2, K = 7 code, newest bit leftmost; G2's output is inverted (ICD, 4.1.4.1)."""
 INTERLEAVER_COLUMNS, INTERLEAVER_ROWS = 30, 8
 """Block interleaver of one page part (ICD, 4.1.4.2)."""
 

@@ -446,6 +446,7 @@ class Decoder:
         self._missed = 0
         self._phase: int | None = None  # confirmed: symbols since the start of the week at index 0
         self._phase_candidate: int | None = None
+        self._candidate_index = -1  # of the header it came from
         self._week_anchor: tuple[int, int, int] | None = None  # (week, index of a symbol in it, phase)
         self._subframes: dict[int, dict[str, float]] = {}
 
@@ -514,20 +515,28 @@ class Decoder:
             return False
         self._drop(first)
         self.synced, self.polarity, self._missed = True, polarity, 0
+        message, _ = self._read(2)
+        self._accept_header(unpack(HEADER, message, SUBFRAME_BITS), self._index)
         return True
 
+    def _read(self, n_words: int) -> tuple[int, np.ndarray]:
+        """Subframe as an upright integer from its first words, and which of them pass parity; sets polarity."""
+        data, good = np.zeros(10, np.int64), np.zeros(10, np.bool_)
+        upright = np.count_nonzero(self._bits[:8] != bits_of(PREAMBLE, 8)) <= 4
+        _check(self._bits, 0, n_words, 0 if upright else 3, data, good)
+        if good[0]:
+            self.polarity = 1 if upright else -1
+        return sum(int(d) << (276 - 30 * w) for w, d in enumerate(data)), good
+
     def _subframe(self) -> tuple[str, int, int, bool]:
-        bits, index = self._bits[:SUBFRAME_BITS], self._index
-        data, good = np.empty(10, np.int64), np.empty(10, np.bool_)
-        upright = np.count_nonzero(bits[:8] != bits_of(PREAMBLE, 8)) <= 4
-        _check(bits, 0, 10, 0 if upright else 3, data, good)
+        index = self._index
+        message, good = self._read(10)
         self.words_ok += int(good.sum())
         self.words_failed += int(10 - good.sum())
-        message = sum(int(d) << (276 - 30 * w) for w, d in enumerate(data))
         header = unpack(HEADER, message, SUBFRAME_BITS)
         number = 0
         if good[0] and good[1] and self._accept_header(header, index):
-            self.polarity, self._missed = (1 if upright else -1), 0
+            self._missed = 0
             number = int(header["subframe"])
         else:
             self._missed += 1
@@ -550,9 +559,9 @@ class Decoder:
         if header["subframe"] != count % 5 + 1:
             return False
         phase = (count * SUBFRAME_BITS - index) % self.symbols_per_week
-        if phase == self._phase_candidate:
+        if phase == self._phase_candidate and index != self._candidate_index:
             self._phase = phase
-        self._phase_candidate = phase
+        self._phase_candidate, self._candidate_index = phase, index
         self.alert = bool(header["alert"])
         return True
 
