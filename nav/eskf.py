@@ -197,17 +197,17 @@ def linear_log(
     return log
 
 
-def replay(log: EpochLog, p0, cov_v, runs: int, rng: np.random.Generator, qd_scale: float = 1.0):
+def replay(log: EpochLog, p0, cov_v, runs: int, rng: np.random.Generator, qd_scale: float = 1.0, e0=None):
     """Simulate the true errors of a filter with the log's gains: innovations (E, runs, m) and errors (E, runs, n).
 
     True noise: w ~ N(0, qd_scale Qd), v ~ N(0, cov_v) with ``cov_v`` (m, m) or (m,) variances, posterior error before
-    epoch 0 ~ N(0, p0).
+    epoch 0 ~ N(0, p0) unless ``e0`` (runs, n) is given.
     """
     e_count, m, n = log.h.shape
     root_v = np.diag(np.sqrt(cov_v)) if np.ndim(cov_v) == 1 else np.linalg.cholesky(cov_v)
     w = rng.standard_normal((e_count, runs, n)) @ (np.sqrt(qd_scale) * _psd_root(log.qd)).transpose(0, 2, 1)
     v = rng.standard_normal((e_count, runs, m)) @ root_v.T
-    e0 = rng.standard_normal((runs, n)) @ _psd_root(np.asarray(p0)).T
+    e0 = rng.standard_normal((runs, n)) @ _psd_root(np.asarray(p0)).T if e0 is None else np.ascontiguousarray(e0)
     r, err = np.empty_like(v), np.empty_like(w)
     kernels.replay(e0, log.phi, log.h, log.k, w, v, r, err)
     return r, err

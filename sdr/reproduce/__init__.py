@@ -1,0 +1,85 @@
+"""Published experiments run again: every module has ``run(out_dir, quick, seed) -> list of rows`` and writes figures.
+
+A row is ``{"item", "published", "ours", "ci_low", "ci_high", "verdict", "note"}`` with verdict "reproduced",
+"not reproduced" or "not stated" (the source gives no number to compare with).
+"""
+
+import csv
+import json
+from pathlib import Path
+
+VERDICTS = ("reproduced", "not reproduced", "not stated")
+COLUMNS = ("item", "published", "ours", "ci_low", "ci_high", "verdict", "note")
+
+
+def row(item, published, ours, ci_low=None, ci_high=None, verdict="not stated", note="") -> dict:
+    """One line of a comparison table; numbers are plain floats so that it goes to JSON unchanged."""
+    if verdict not in VERDICTS:
+        raise ValueError(f"verdict must be one of {', '.join(VERDICTS)}, not {verdict!r}.")
+
+    def plain(value):
+        return value if value is None or isinstance(value, str) else float(value)
+
+    values = (item, plain(published), plain(ours), plain(ci_low), plain(ci_high), verdict, note)
+    return dict(zip(COLUMNS, values))
+
+
+def within(published: float, low: float, high: float) -> str:
+    """Verdict of a published number against an interval of ours (or of ours against the published one's)."""
+    return "reproduced" if low <= published <= high else "not reproduced"
+
+
+def clopper_pearson(k: int, n: int, level: float = 0.95) -> tuple[float, float]:
+    """Exact binomial interval of k hits in n trials (Clopper and Pearson 1934)."""
+    from scipy.stats import beta
+
+    if n < 1 or not 0 <= k <= n:
+        raise ValueError(f"Counts must obey 0 <= k <= n with n >= 1, not k = {k}, n = {n}.")
+    tail = (1 - level) / 2
+    low = 0.0 if k == 0 else float(beta.ppf(tail, k, n - k + 1))
+    high = 1.0 if k == n else float(beta.ppf(1 - tail, k + 1, n - k))
+    return low, high
+
+
+def write_table(rows: list[dict], out_dir: str | Path, name: str) -> Path:
+    """Write ``name``.csv and ``name``.json into ``out_dir``; returns the CSV's path."""
+    out = Path(out_dir)
+    out.mkdir(parents=True, exist_ok=True)
+    path = out / f"{name}.csv"
+    with path.open("w", newline="", encoding="utf-8") as handle:
+        writer = csv.DictWriter(handle, COLUMNS)
+        writer.writeheader()
+        writer.writerows(rows)
+    (out / f"{name}.json").write_text(json.dumps(rows, indent=1), encoding="utf-8")
+    return path
+
+
+def format_table(rows: list[dict]) -> str:
+    """The table as aligned text, for a terminal."""
+
+    def text(value):
+        return "" if value is None else value if isinstance(value, str) else f"{value:.4g}"
+
+    table = [COLUMNS, *(tuple(text(r[c]) for c in COLUMNS) for r in rows)]
+    width = [max(len(line[i]) for line in table) for i in range(len(COLUMNS) - 1)]
+    return "\n".join("  ".join([*(c.ljust(w) for c, w in zip(line, width)), line[-1]]).rstrip() for line in table)
+
+
+def save_figure(figure, out_dir: str | Path, name: str) -> Path:
+    """Write a matplotlib figure as PNG and release it."""
+    out = Path(out_dir)
+    out.mkdir(parents=True, exist_ok=True)
+    path = out / f"{name}.png"
+    figure.savefig(path, dpi=110)
+    figure.clear()
+    return path
+
+
+def new_figure(rows: int, columns: int, size=(9.0, 6.0), **options):
+    """(figure, axes) of a file-only figure; matplotlib is imported here and pyplot's state is not used."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure, figure.subplots(rows, columns, **options)
