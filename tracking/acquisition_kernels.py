@@ -1,0 +1,108 @@
+"""Kernels of the acquisition chain, on plain arrays."""
+
+import numba as nb
+import numpy as np
+
+
+@nb.njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"})
+def resample(xi, xq, taps, ratio, out):
+    """out[:, j] = x at time j * ratio (input samples), by the interpolator's nearest row.
+
+    ``taps`` float32 (P + 1, n_taps): row r interpolates r/P of a sample behind tap n_taps/2 - 1. Beyond the ends of
+    x lie zeros. ``out`` float32 (2, n_out).
+    """
+    n, n_taps, n_phase = len(xi), taps.shape[1], taps.shape[0] - 1
+    for j in range(out.shape[1]):
+        t = j * ratio
+        i = int(t)
+        row = taps[int((t - i) * n_phase + 0.5)]
+        first = i - n_taps // 2 + 1
+        lo, hi = max(0, -first), min(n_taps, n - first)
+        re, im = np.float32(0), np.float32(0)
+        for k in range(lo, hi):
+            re += row[k] * xi[first + k]
+            im += row[k] * xq[first + k]
+        out[0, j] = re
+        out[1, j] = im
+
+
+@nb.njit(cache=True, nogil=True, fastmath={"contract"})
+def shifted_product(spectrum, shift, template, out):
+    """out[k] = spectrum[(k + shift) mod n] * template[k]; complex64 (n,), 0 <= shift < n."""
+    n = len(out)
+    for k in range(n - shift):
+        out[k] = spectrum[k + shift] * template[k]
+    for k in range(n - shift, n):
+        out[k] = spectrum[k + shift - n] * template[k]
+
+
+@nb.njit(cache=True, nogil=True, fastmath={"contract"})
+def add_power(y, shift, acc):
+    """acc[i] += |y[(i - shift) mod n]|^2, n = len(acc) <= len(y), 0 <= shift < n."""
+    n = len(acc)
+    for i in range(shift):
+        v = y[i - shift + n]
+        acc[i] += v.real * v.real + v.imag * v.imag
+    for i in range(shift, n):
+        v = y[i - shift]
+        acc[i] += v.real * v.real + v.imag * v.imag
+
+
+@nb.njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz", "nnan"})
+def row_peak(acc, guard):
+    """(peak, its index, mean of the cells further than ``guard`` from it, circularly)."""
+    n = len(acc)
+    total, peak = np.float32(0), np.float32(0)
+    for i in range(n):
+        total += acc[i]
+        peak = max(peak, acc[i])
+    at = 0
+    while acc[at] != peak:
+        at += 1
+    near = np.float64(0)
+    for i in range(at - guard, at + guard + 1):
+        near += acc[i % n]
+    return peak, at, (np.float64(total) - near) / (n - 2 * guard - 1)
+
+
+@nb.njit(cache=True, nogil=True)
+def rotate(x, cycles_per_sample, out):
+    """out = x exp(-2 pi i f n), planar float32 (2, n); the phase is exact at every 256th sample."""
+    step = np.exp(-2j * np.pi * cycles_per_sample)
+    table = np.empty((2, 256), np.float32)
+    w = 1.0 + 0.0j
+    for k in range(256):
+        table[0, k], table[1, k] = w.real, w.imag
+        w *= step
+    n = x.shape[1]
+    for first in range(0, n, 256):
+        turn = (cycles_per_sample * first) % 1.0
+        c, s = np.float32(np.cos(2 * np.pi * turn)), np.float32(-np.sin(2 * np.pi * turn))
+        for k in range(min(256, n - first)):
+            re = c * table[0, k] - s * table[1, k]
+            im = c * table[1, k] + s * table[0, k]
+            a, b = x[0, first + k], x[1, first + k]
+            out[0, first + k] = a * re - b * im
+            out[1, first + k] = a * im + b * re
+
+
+@nb.njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"})
+def piece_sums(x, table, samples_per_chip, length, phase_chips, chips_per_sample, first, piece, out):
+    """Correlate consecutive pieces of ``piece`` samples (not an integer) with the code.
+
+    x planar float32 (2, n); ``table`` as ``signals.modulation.CodeTable``; ``phase_chips``: code phase at sample 0;
+    piece p covers samples round(first + p piece) .. round(first + (p + 1) piece); ``out`` complex128 (pieces,).
+    """
+    n_phase = table.shape[0]
+    for p in range(len(out)):
+        lo, hi = int(first + p * piece + 0.5), int(first + (p + 1) * piece + 0.5)
+        phase = (phase_chips + lo * chips_per_sample) % length
+        q = int(phase * samples_per_chip * n_phase + 0.5)
+        row = table[q % n_phase]
+        column = q // n_phase
+        re, im = np.float32(0), np.float32(0)
+        for k in range(hi - lo):
+            c = np.float32(row[column + k])
+            re += c * x[0, lo + k]
+            im += c * x[1, lo + k]
+        out[p] = complex(re, im)
