@@ -26,7 +26,7 @@ SECONDARY_SYNC = (0b00000100, 0b00101011, 0b00101111)
 REFERENCE_SQRT_A = np.sqrt(29_600_000.0)
 REFERENCE_INCLINATION_RAD = 56.0 / 180.0 * GNSS_PI
 
-# --- tables -------------------------------------------------------------------------------------------------
+# --- tables ---
 
 
 TYPE = integer("type", 1, 6)
@@ -188,7 +188,7 @@ ORDER = (
 )
 """Word types of the 15 pages of even and odd sub-frames of 30 s; 63 stands for words 16 to 20 and 22."""
 
-# --- encoder ------------------------------------------------------------------------------------------------
+# --- encoder ---
 
 
 def page_symbols(word: int, secondary_sync: int = 0, page_type: int = 0) -> np.ndarray:
@@ -391,7 +391,7 @@ def quantised(ephemeris: np.void) -> np.void:
     return record
 
 
-# --- decoder ------------------------------------------------------------------------------------------------
+# --- decoder ---
 
 
 def decode_part(symbols: np.ndarray) -> tuple[np.ndarray, int]:

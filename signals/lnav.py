@@ -17,7 +17,7 @@ SUBFRAME_BITS = 300
 SUBFRAMES_PER_WEEK = 100_800
 PREAMBLE = 0b10001011
 
-# --- tables -------------------------------------------------------------------------------------------------
+# --- tables ---
 
 HEADER = (
     integer("preamble", 1, 8),
@@ -129,7 +129,7 @@ REFERENCE_INCLINATION_RAD = 0.30 * GNSS_PI
 ALTERNATING = sum(0xAAAAAA << (6 + 30 * (9 - word)) for word in range(2, 10)) & ((1 << 232) - 1) & ~(3 << 6)
 """Alternating ones and zeros behind the SV ID of a dummy page (20.3.3.5.1.2)."""
 
-# --- parity -------------------------------------------------------------------------------------------------
+# --- parity ---
 
 PARITY_MASKS = (0x2EC7CD2, 0x1763E69, 0x2BB1F34, 0x15D8F9A, 0x1AEC7CD, 0x22DEA27)
 """Equations of D25..D30 over [D29* D30* d1..d24] (table 20-XIV)."""
@@ -217,7 +217,7 @@ def _find(bits, start):
     return -1, 0
 
 
-# --- encoder ------------------------------------------------------------------------------------------------
+# --- encoder ---
 
 
 def _values(record: np.void) -> dict[str, float]:
@@ -391,7 +391,7 @@ def quantised(ephemeris: np.void) -> np.void:
     return record
 
 
-# --- decoder ------------------------------------------------------------------------------------------------
+# --- decoder ---
 
 
 def nearest_week(truncated: int, modulus: int, week: int) -> int:
@@ -520,7 +520,7 @@ class Decoder:
         return True
 
     def _read(self, n_words: int) -> tuple[int, np.ndarray]:
-        """Subframe as an upright integer from its first words, and which of them pass parity; sets polarity."""
+        """Subframe as an upright integer from its first words, and which pass parity; sets polarity."""
         data, good = np.zeros(10, np.int64), np.zeros(10, np.bool_)
         upright = np.count_nonzero(self._bits[:8] != bits_of(PREAMBLE, 8)) <= 4
         _check(self._bits, 0, n_words, 0 if upright else 3, data, good)

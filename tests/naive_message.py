@@ -1,4 +1,4 @@
-"""Textbook twins of the message coding: written from the equations, for clarity, sharing nothing with signals."""
+"""Textbook twins of the message coding: from the equations, sharing nothing with signals."""
 
 import numpy as np
 
@@ -76,7 +76,7 @@ def page(word: list[int], secondary_sync: list[int], odd_middle: list[int] | Non
 def viterbi(soft: np.ndarray) -> np.ndarray:
     """Maximum-likelihood bits of many terminated code words at once, float64 (pages, 2 n) -> (pages, n).
 
-    The register is kept with the newest bit in the lowest place (unlike signals.fec), the state is its low six bits.
+    The register holds the newest bit in its lowest place (unlike signals.fec); the state is its low six bits.
     """
     pages, n = soft.shape[0], soft.shape[1] // 2
     state = np.arange(64)

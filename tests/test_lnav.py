@@ -62,7 +62,7 @@ def flip(bits: np.ndarray, *places: int) -> np.ndarray:
     return bits
 
 
-# --- the message ------------------------------------------------------------------------------------------------
+# --- the message ---
 
 
 def test_parity_vector() -> None:
@@ -139,7 +139,7 @@ def test_out_of_range_is_refused_by_name(name: str) -> None:
 def test_other_values_that_cannot_be_sent() -> None:
     with pytest.raises(ValueError, match="e = nan is not a finite number"):
         stream(30, 0, ephemeris(e=np.nan))
-    with pytest.raises(ValueError, match="toe_s = 7203.0 must be a whole multiple of 16 s"):
+    with pytest.raises(ValueError, match=r"toe_s = 7203\.0 must be a whole multiple of 16 s"):
         stream(30, 0, ephemeris(toe_s=7203.0))
     with pytest.raises(ValueError, match="IODE 78 must equal the low 8 bits of IODC 333"):
         stream(30, 0, ephemeris(iodc=333, iode=78))
@@ -147,7 +147,7 @@ def test_other_values_that_cannot_be_sent() -> None:
         stream(30, 0, np.array([ephemeris(5), ephemeris(6)]))
 
 
-# --- the decoder ------------------------------------------------------------------------------------------------
+# --- the decoder ---
 
 
 @pytest.mark.parametrize("sign", [1, -1])
@@ -237,7 +237,8 @@ def test_half_cycle_slip_costs_the_word_it_hits() -> None:
 def test_noise_never_yields_a_wrong_ephemeris() -> None:
     """Bit error rate 1 %: words pass with probability (0.99^32) on average; what passes is right.
 
-    A word is undetected wrong only with 4 or more errors that parity misses: 32-bit words, C(32,4) 1e-8 2^-6 = 6e-6.
+    A word is undetected wrong only with 4 or more errors that parity misses: 32-bit words, C(32,4) 1e-8 2^-6
+    = 6e-6.
     """
     rng = np.random.default_rng(2)
     decoder, bits = lnav.Decoder(5), stream(3000, 0).astype(np.float32)
