@@ -123,6 +123,7 @@ class Navigator:
         self.innovations = np.zeros((0, 3))
         self._steered_m = 0.0
         self._state = None  # (5,) last position, bias, ISB
+        self._vel = np.zeros(3)
         self._isb_known = False
         self._x = np.zeros(kernels.N_EKF)
         self._p = np.zeros((kernels.N_EKF, kernels.N_EKF))
@@ -235,7 +236,7 @@ class Navigator:
         if galileo.all() or not galileo.any():
             return none, none, False
         if self._isb_known and obs.size < 5:
-            return none, -galileo * self._state[4], False
+            return none, galileo * -self._state[4], False
         return galileo.astype(float), none, True
 
     def _week(self, eph):
@@ -269,7 +270,7 @@ class Navigator:
         else:
             start = self._state
         for _ in range(3):  # elevations and delays come from the position of the pass before
-            pvt.look(sats, start[:3], tow_s, klobuchar, self.spec.tropo != "none")
+            pvt.look(sats, start[:3], self._vel, tow_s, klobuchar, self.spec.tropo != "none")
             use = self._above_mask(sats)
             self._say_masked(use)
             corrected = self._corrected(obs, sats, offset, "pseudorange_smoothed_m")
@@ -286,9 +287,13 @@ class Navigator:
                 f"GDOP {gdop:.0f} exceeds {self.spec.gdop_max:g}: "
                 f"the {int(fix.use.sum())} satellites stand too close together."
             )
-        rate = pvt.range_rate(obs, sats)
         rate_var = pvt.rate_variance(obs["cn0_dbhz"], self.spec.sigma_doppler_mps, 0.02)
-        velocity = pvt.solve_velocity(sats, rate, rate_var, fix.use, fix.state[:3])
+        for _ in range(2):  # the rate of the troposphere wants the velocity
+            velocity = pvt.solve_velocity(sats, pvt.range_rate(obs, sats), rate_var, fix.use, fix.state[:3])
+            if np.linalg.norm(velocity.vel_ecef_mps - self._vel) < 0.3:
+                break
+            self._vel = velocity.vel_ecef_mps
+            pvt.look(sats, fix.state[:3], self._vel, tow_s, klobuchar, self.spec.tropo != "none")
         self.residual_m = fix.residual_m
         self.used = [_name(s, p) for s, p, u in zip(sats["system"], sats["prn"], fix.use) if u]
         state = self._settle(fix, estimate)
@@ -375,7 +380,8 @@ class Navigator:
         self._predict(sample)
         second, offset, estimate = self._second(obs, eph, iono_utc_galileo)
         klobuchar = self._klobuchar(iono_utc_gps)
-        pvt.look(sats, self._x[:3], obs["tow_tx_s"][0], klobuchar, self.spec.tropo != "none")
+        tropo = self.spec.tropo != "none"
+        pvt.look(sats, self._x[:3], self._x[3:6], obs["tow_tx_s"][0], klobuchar, tropo)
         use = self._above_mask(sats) == 1
         n = int(use.sum())
         ranges = self._corrected(obs, sats, offset, "pseudorange_m")[use]

@@ -99,42 +99,44 @@ def _line_of_sight(r, pos, sat):
 
 
 @njit(cache=True, nogil=True)
-def _look_kernel(pos, lat, lon, height, sat_pos, sat_vel, tow_s, iono_on, alpha, beta, tropo_on, out):
+def _look_kernel(pos, vel, lat, lon, height, sat_pos, sat_vel, tow_s, iono_on, alpha, beta, tropo_on, out):
     r = rotation_enu_to_ecef(lat, lon)
+    climb = r[0, 2] * vel[0] + r[1, 2] * vel[1] + r[2, 2] * vel[2]
     for i in range(sat_pos.shape[0]):
         out[i, :] = 0.0
         iono_before, tropo_before = 0.0, 0.0
         for late in range(1, -1, -1):  # one second later first: the difference is the rate
-            az, el = _line_of_sight(r, pos, sat_pos[i] + late * sat_vel[i])
+            az, el = _line_of_sight(r, pos, sat_pos[i] + late * (sat_vel[i] - vel))
             if el < 0.02:
                 continue
             if iono_on:
                 delay_s = klobuchar_kernel(lat, lon, az, el, tow_s + late, alpha, beta, KLOBUCHAR_X_ICD)
                 out[i, 2] = C_MPS * delay_s
             if tropo_on:
-                out[i, 3] = saastamoinen_kernel(lat, height, el, HUMIDITY)
+                out[i, 3] = saastamoinen_kernel(lat, height + late * climb, el, HUMIDITY)
             if late == 1:
                 iono_before, tropo_before = out[i, 2], out[i, 3]
         out[i, 0], out[i, 1] = az % (2.0 * math.pi), el
         out[i, 4] = (tropo_before - out[i, 3]) - (iono_before - out[i, 2])
 
 
-def look(sats, pos_ecef_m, tow_s, klobuchar=None, troposphere=False):
+def look(sats, pos_ecef_m, vel_ecef_mps, tow_s, klobuchar=None, troposphere=False):
     """Fill azimuth, elevation, the two delays and their rate of ``sats`` in place, seen from pos_ecef_m.
 
     ``klobuchar`` is (alpha (4,), beta (4,)) or None. Below 1.1 deg and for positions off the Earth (height
-    outside -5..100 km) the delays are zero: the models do not hold there. The rate leaves the receiver's own
-    motion out (1e-5 m/s at 30 m/s).
+    outside -5..100 km) the delays are zero: the models do not hold there. The velocity matters for the
+    rate alone (a climb of 1 m/s lowers the zenith delay by 0.3 mm/s).
     """
     pos = np.ascontiguousarray(pos_ecef_m, dtype=float)
     lat, lon, height = geodetic_from_ecef(pos)
     near = -5e3 < height < 100e3
     alpha, beta = klobuchar if klobuchar is not None else (np.zeros(4), np.zeros(4))
     alpha, beta = (np.ascontiguousarray(c, dtype=float) for c in (alpha, beta))
+    vel = np.ascontiguousarray(vel_ecef_mps, dtype=float)
     out = np.zeros((sats.size, 5))
     sat_pos, sat_vel = (np.ascontiguousarray(sats[f]) for f in ("pos_ecef_m", "vel_ecef_mps"))
     _look_kernel(
-        pos, lat, lon, height, sat_pos, sat_vel, float(tow_s),
+        pos, vel, lat, lon, height, sat_pos, sat_vel, float(tow_s),
         klobuchar is not None and near, alpha, beta, bool(troposphere and near), out,
     )  # fmt: skip
     names = ("azimuth_rad", "elevation_rad", "iono_m", "tropo_m", "atmosphere_rate_mps")

@@ -26,7 +26,7 @@ def transmit(sky, t_s, noise_m=0.0, rate_noise_mps=0.0, rng=None, fault_m=None):
     for k, i in enumerate(seen):
         sat = sky.satellites[i]
         delay = p.delay_s[i, 0] + (fault_m or {}).get(sat.name, 0.0) / C_MPS
-        doppler = -F_L1_HZ * p.delay_rate_s_s[i, 0]
+        doppler = -F_L1_HZ * p.phase_delay_rate_s_s[i, 0]
         if rng is not None:
             delay += noise_m / C_MPS * rng.standard_normal()
             doppler += rate_noise_mps / WAVELENGTH_M * rng.standard_normal()
