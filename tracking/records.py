@@ -41,11 +41,19 @@ EPOCH = np.dtype(
         ("code_rate_hz", "f8"),
         ("prompt_i", "f4"),
         ("prompt_q", "f4"),
-        ("prompt2_i", "f4"),  # second half of the integration alone (frequency discriminators)
+        (
+            "prompt2_i",
+            "f4",
+        ),  # second half of the integration's sum, over all n_samples: first half = prompt - prompt2
         ("prompt2_q", "f4"),
         ("data_i", "f4"),  # E1-B prompt while the pilot carries the loops; else 0
         ("data_q", "f4"),
-        ("noise_power", "f4"),  # |noise-reference tap|^2 smoothed, per integration
+        ("noise_i", "f4"),  # noise-reference tap of this integration, as the prompt
+        ("noise_q", "f4"),
+        (
+            "noise_power",
+            "f4",
+        ),  # |noise-reference tap|^2 of one code period, smoothed, scaled to the integration
         ("code_error_chips", "f4"),  # discriminator outputs, replica rounding removed
         ("phase_error_cycles", "f4"),
         ("freq_error_hz", "f4"),
@@ -68,3 +76,25 @@ AIDING = np.dtype(
     ]
 )
 """What navigation hands to tracking for the NEXT slab: stamped for the interval in which it is used."""
+
+REPLICA = np.dtype(
+    [
+        ("sample_index", "u8"),
+        ("signal", "S4"),
+        ("prn", "i4"),
+        ("state", "u1"),
+        ("code_phase_chips", "f8"),  # primary code, in [0, L)
+        ("code_period", "i8"),  # whole code periods since the channel started
+        ("carrier_phase_cycles", "f8"),
+        ("doppler_hz", "f8"),  # of the loop filter (steered: of the NCO)
+        ("doppler_rate_hz_s", "f8"),
+        ("cn0_dbhz", "f8"),
+        ("cn0_prompt_dbhz", "f8"),
+        ("carrier_lock", "f8"),
+        ("code_lock", "f8"),
+        ("phase_locked", "?"),
+        ("lock_s", "f8"),  # since the phase was declared locked
+        ("slips", "i8"),  # cycle slips flagged since the channel started
+    ]
+)
+"""The replica of one channel at a common receiver sample (``Tracker.snapshot``): no raw discriminator in it."""

@@ -1,0 +1,934 @@
+"""The tracking kernel: correlate, discriminate, filter and steer, channel by channel, one code period at a time.
+
+One call of ``track_slab`` takes every listed channel through all whole code periods of the samples given. The unit of
+work is the code period of the channel's own replica, so results do not depend on where slabs are cut.
+
+Correlator. Blocks of at most 1024 samples; per block one row and column of the code table per tap (all taps share the
+rounding of the replica's phase, whose mean is removed from the code error), one carrier table per frequency, the phase
+of a block applied to its sums. Up to 7 taps are wiped and correlated in one pass; more go through a wiped buffer in L1.
+
+The functions of ``discriminators`` and ``lock`` are compiled into this file's cache entry: clear ``__pycache__`` after
+editing them.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from signals.constants import CHIP_RATE_HZ, F_L1_HZ
+from tracking.discriminators import (
+    COHERENT,
+    FOUR_QUADRANT,
+    carrier_error_cycles,
+    code_error,
+    frequency_error_hz,
+)
+from tracking.lock import (
+    STATE_BIT_SYNC,
+    STATE_LOCKED,
+    STATE_LOST,
+    STATE_PULL_IN,
+    carrier_lock,
+    cn0_moments_dbhz,
+    cn0_noise_reference_dbhz,
+    code_lock,
+)
+
+__all__ = ["CHANNEL", "HISTORY", "SYMBOL", "track_slab"]
+
+HISTORY = 200
+"""Prompts kept for the open-loop search: 200 ms of 1 ms (C/A), or 50 periods of 4 ms in halves (E1)."""
+BITS_PER_PERIODS = 20
+KIND_CA, KIND_PILOT, KIND_DATA = 0, 1, 2
+
+SYMBOL = np.dtype(
+    [
+        ("sample_index", "u8"),  # first sample of the symbol
+        ("code_period", "i8"),  # code periods since the channel started, at the symbol's start
+        ("soft", "f4"),  # in-phase sum / samples; sign not resolved
+        ("soft_q", "f4"),
+    ]
+)
+"""One data symbol: 20 ms of C/A, 4 ms of E1-B."""
+
+CHANNEL = np.dtype(
+    [
+        # What does not change while the channel runs.
+        ("signal", "S4"),
+        ("prn", "i4"),
+        ("kind", "i4"),
+        ("code_length_chips", "f8"),
+        ("period_s", "f8"),
+        ("samples_per_chip", "f8"),
+        ("n_phase", "i8"),
+        ("phase_shift", "i8"),  # log2(n_phase)
+        ("wrap_q", "i8"),  # code period in 1/P samples, rounded
+        ("wrap_error_q", "f8"),  # rounded minus exact
+        ("table_start", "i8"),
+        ("data_table_start", "i8"),
+        ("table_columns", "i8"),
+        ("scale", "f8"),
+        ("data_scale", "f8"),
+        ("n_taps", "i4"),
+        ("n_sums", "i4"),  # taps + noise reference (+ data prompt)
+        ("very_early", "i4"),  # -1: none
+        ("early", "i4"),
+        ("prompt", "i4"),
+        ("late", "i4"),
+        ("very_late", "i4"),
+        ("very_offset_chips", "f8"),
+        ("carrier_code", "i4"),
+        ("code_code", "i4"),
+        ("code_scale_chips", "f8"),
+        ("pull_scale_chips", "f8"),  # of the power discriminator
+        ("r_half", "f8"),  # R(d/2) / R(0)
+        ("m_settle", "i4"),  # code periods per integration
+        ("m_track", "i4"),
+        ("pll_settle", "f8", 3),
+        ("pll_track", "f8", 3),
+        ("dll_pull", "f8"),
+        ("dll_settle", "f8"),
+        ("dll_track", "f8", 2),
+        ("fll_settle", "f8"),
+        ("fll_track", "f8"),
+        ("settle_s", "f8"),
+        ("cn0_window_s", "f8"),
+        ("cn0_min_dbhz", "f8"),
+        ("lock_in", "f8"),
+        ("lock_out", "f8"),
+        ("lost_after_s", "f8"),
+        # NCOs, at next_sample.
+        ("state", "i4"),
+        ("next_sample", "i8"),
+        ("code_phase_chips", "f8"),
+        ("code_period", "i8"),
+        ("carrier_cycles", "f8"),
+        ("doppler_hz", "f8"),
+        ("doppler_rate_hz_s", "f8"),
+        ("steered", "i4"),
+        # Loop filters.
+        ("rate_hz", "f8"),
+        ("rate_hz_s", "f8"),
+        ("code_rate_chips_s", "f8"),
+        # The integration that is running.
+        ("m_done", "i4"),
+        ("m_total", "i4"),
+        ("n_acc", "i8"),
+        ("start_sample", "i8"),
+        ("start_period", "i8"),
+        ("start_code_chips", "f8"),
+        ("start_carrier_cycles", "f8"),
+        ("start_doppler_hz", "f8"),
+        ("rounding_sum", "f8"),
+        ("second_i", "f8"),
+        ("second_q", "f8"),
+        ("data_i", "f8"),
+        ("data_q", "f8"),
+        # Smoothed moments and their counts.
+        ("noise_ema", "f8"),  # noise power of one sample
+        ("noise_n", "f8"),
+        ("p2_ema", "f8"),
+        ("i2_ema", "f8"),
+        ("i4_ema", "f8"),
+        ("moment_n", "f8"),
+        ("lock_diff", "f8"),
+        ("lock_sum", "f8"),
+        ("lock_el", "f8"),
+        ("lock_n", "f8"),
+        ("el_ema", "f8"),
+        ("el_n", "f8"),
+        ("half_i", "f8"),
+        ("half_q", "f8"),
+        ("half_n", "f8"),
+        ("bump_ve", "f8"),
+        ("bump_p", "f8"),
+        ("bump_vl", "f8"),
+        ("bump_n", "f8"),
+        # Synchronisation and lock.
+        ("hist_n", "i4"),
+        ("hist_period", "i8"),
+        ("attempts", "i4"),
+        ("bit_energy", "f8", 20),
+        (
+            "symbol_phase",
+            "i8",
+        ),  # C/A: code period modulo 20 at which bits start; E1-C: chip of CS25_1 at period 0
+        ("symbol_i", "f8"),
+        ("symbol_q", "f8"),
+        ("symbol_n", "i8"),
+        ("symbol_start", "i8"),
+        ("symbol_period", "i8"),
+        ("symbol_m", "i4"),
+        ("settling", "i4"),
+        ("locked_time_s", "f8"),  # since loops closed
+        ("phase_locked", "i4"),
+        ("lock_start_sample", "i8"),
+        ("bad_s", "f8"),
+        ("slips", "i8"),
+        ("jumps", "i8"),
+        ("cn0_dbhz", "f8"),
+        ("cn0_prompt_dbhz", "f8"),
+        ("carrier_lock", "f8"),
+        ("code_lock", "f8"),
+    ],
+    align=True,
+)
+"""One channel: what is constant, its NCOs, filters, smoothed moments and lock state."""
+
+_BLOCK = 1024
+_FAST = {"reassoc", "contract", "nsz", "arcp"}
+_TWO_PI = 2.0 * math.pi
+_F = np.float32
+_U = np.uint64
+
+
+# ------------------------------------------------------------------------------------------------- correlator
+@njit(fastmath=_FAST, nogil=True)
+def _fused4(xi, xq, a, n, ct, sn, pool, s0, s1, s2, s3, out):
+    """Wipe off the carrier and correlate four taps in one pass."""
+    a0 = a1 = a2 = a3 = b0 = b1 = b2 = b3 = _F(0.0)
+    for j in range(n):
+        x, y, c, s = _F(xi[a + j]), _F(xq[a + j]), ct[j], sn[j]
+        u = x * c + y * s
+        v = y * c - x * s
+        p = _F(pool[s0 + j])
+        a0 += p * u
+        b0 += p * v
+        p = _F(pool[s1 + j])
+        a1 += p * u
+        b1 += p * v
+        p = _F(pool[s2 + j])
+        a2 += p * u
+        b2 += p * v
+        p = _F(pool[s3 + j])
+        a3 += p * u
+        b3 += p * v
+    out[0], out[1], out[2], out[3], out[4], out[5], out[6], out[7] = a0, b0, a1, b1, a2, b2, a3, b3
+
+
+@njit(fastmath=_FAST, nogil=True)
+def _fused7(xi, xq, a, n, ct, sn, pool, s0, s1, s2, s3, s4, s5, s6, out):
+    """As ``_fused4`` with seven taps."""
+    a0 = a1 = a2 = a3 = a4 = a5 = a6 = b0 = b1 = b2 = b3 = b4 = b5 = b6 = _F(0.0)
+    for j in range(n):
+        x, y, c, s = _F(xi[a + j]), _F(xq[a + j]), ct[j], sn[j]
+        u = x * c + y * s
+        v = y * c - x * s
+        p = _F(pool[s0 + j])
+        a0 += p * u
+        b0 += p * v
+        p = _F(pool[s1 + j])
+        a1 += p * u
+        b1 += p * v
+        p = _F(pool[s2 + j])
+        a2 += p * u
+        b2 += p * v
+        p = _F(pool[s3 + j])
+        a3 += p * u
+        b3 += p * v
+        p = _F(pool[s4 + j])
+        a4 += p * u
+        b4 += p * v
+        p = _F(pool[s5 + j])
+        a5 += p * u
+        b5 += p * v
+        p = _F(pool[s6 + j])
+        a6 += p * u
+        b6 += p * v
+    out[0], out[1], out[2], out[3], out[4], out[5], out[6] = a0, b0, a1, b1, a2, b2, a3
+    out[7], out[8], out[9], out[10], out[11], out[12], out[13] = b3, a4, b4, a5, b5, a6, b6
+
+
+@njit(fastmath=_FAST, nogil=True)
+def _wipe(xi, xq, a, n, ct, sn, wi, wq):
+    for j in range(n):
+        x, y, c, s = _F(xi[a + j]), _F(xq[a + j]), ct[j], sn[j]
+        wi[j] = x * c + y * s
+        wq[j] = y * c - x * s
+
+
+@njit(fastmath=_FAST, nogil=True)
+def _dot4(wi, wq, n, pool, s0, s1, s2, s3, out, o):
+    a0 = a1 = a2 = a3 = b0 = b1 = b2 = b3 = _F(0.0)
+    for j in range(n):
+        u, v = wi[j], wq[j]
+        p = _F(pool[s0 + j])
+        a0 += p * u
+        b0 += p * v
+        p = _F(pool[s1 + j])
+        a1 += p * u
+        b1 += p * v
+        p = _F(pool[s2 + j])
+        a2 += p * u
+        b2 += p * v
+        p = _F(pool[s3 + j])
+        a3 += p * u
+        b3 += p * v
+    out[o], out[o + 1], out[o + 2], out[o + 3] = a0, b0, a1, b1
+    out[o + 4], out[o + 5], out[o + 6], out[o + 7] = a2, b2, a3, b3
+
+
+@njit(nogil=True)
+def _correlate_block(xi, xq, a, n, ct, sn, pool, starts, n_sums, wi, wq, out):
+    """All sums of one block into ``out`` (I, Q interleaved); ``starts`` is padded to a multiple of four."""
+    if n_sums <= 4:
+        _fused4(xi, xq, a, n, ct, sn, pool, starts[0], starts[1], starts[2], starts[3], out)
+    elif n_sums <= 7:
+        _fused7(
+            xi, xq, a, n, ct, sn, pool,
+            starts[0], starts[1], starts[2], starts[3], starts[4], starts[5], starts[6], out,
+        )  # fmt: skip
+    else:
+        _wipe(xi, xq, a, n, ct, sn, wi, wq)
+        for t in range(0, n_sums, 4):
+            _dot4(wi, wq, n, pool, starts[t], starts[t + 1], starts[t + 2], starts[t + 3], out, 2 * t)
+
+
+@njit(nogil=True)
+def _carrier_table(step_cycles, ct, sn):
+    """exp(2 pi i step j), j < 1024, as 32 x 32 products of rotations built in double precision."""
+    bc, bs = np.empty(32, np.float32), np.empty(32, np.float32)
+    c1, s1 = math.cos(_TWO_PI * step_cycles), math.sin(_TWO_PI * step_cycles)
+    c, s = 1.0, 0.0
+    for j in range(32):
+        bc[j], bs[j] = c, s
+        c, s = c * c1 - s * s1, c * s1 + s * c1
+    c32, s32 = c, s
+    c, s = 1.0, 0.0
+    for m in range(32):
+        fc, fs = _F(c), _F(s)
+        for j in range(32):
+            ct[32 * m + j] = bc[j] * fc - bs[j] * fs
+            sn[32 * m + j] = bc[j] * fs + bs[j] * fc
+        c, s = c * c32 - s * s32, c * s32 + s * c32
+
+
+@njit(nogil=True)
+def _correlate_period(st, xi, xq, a0, n, theta, step, rate, ct, sn, pool, tap_q, starts, wi, wq, out, sums):
+    """One code period: ``sums`` (n_sums + 1 complex as pairs; the last is the prompt's second half).
+
+    theta, step: carrier phase at the first sample and its advance per sample, cycles. Returns the sum over samples of
+    (replica's phase - nominal phase), chips, at the mean of E and L.
+    """
+    n_sums, shift, mask = st.n_sums, st.phase_shift, st.n_phase - 1
+    blocks = 2 * ((n + 2 * _BLOCK - 1) // (2 * _BLOCK))
+    block = min(_BLOCK, ((n + blocks - 1) // blocks + 31) // 32 * 32)
+    n_blocks = (n + block - 1) // block
+    for k in range(2 * n_sums + 2):
+        sums[k] = 0.0
+    c, s = math.cos(_TWO_PI * theta), math.sin(_TWO_PI * theta)
+    dc, ds = math.cos(_TWO_PI * step * block), math.sin(_TWO_PI * step * block)
+    rounding = 0.0
+    for b in range(n_blocks):
+        a = b * block
+        nb = min(block, n - a)
+        middle = st.code_phase_chips + (a + 0.5 * nb) * rate
+        q0 = math.floor((middle * st.samples_per_chip - 0.5 * nb) * st.n_phase + 0.5)
+        delta = (q0 / st.n_phase + 0.5 * nb) / st.samples_per_chip - middle
+        for t in range(n_sums):
+            q = np.int64(q0) + tap_q[t]
+            wrapped = 0.0
+            while q < 0:
+                q += st.wrap_q
+                wrapped += st.wrap_error_q
+            while q >= st.wrap_q:
+                q -= st.wrap_q
+                wrapped -= st.wrap_error_q
+            if wrapped != 0.0 and (t == st.early or t == st.late):
+                delta += 0.5 * wrapped / (st.n_phase * st.samples_per_chip)
+            base = st.data_table_start if t > st.n_taps else st.table_start
+            starts[t] = _U(base + (q & mask) * st.table_columns + (q >> shift))
+        rounding += delta * nb
+        _correlate_block(xi, xq, _U(a0 + a), _U(nb), ct, sn, pool, starts, n_sums, wi, wq, out)
+        for t in range(n_sums):
+            re, im = np.float64(out[2 * t]), np.float64(out[2 * t + 1])
+            sums[2 * t] += re * c + im * s
+            sums[2 * t + 1] += im * c - re * s
+        if 2 * b >= n_blocks:
+            re, im = np.float64(out[2 * st.prompt]), np.float64(out[2 * st.prompt + 1])
+            sums[2 * n_sums] += re * c + im * s
+            sums[2 * n_sums + 1] += im * c - re * s
+        c, s = c * dc - s * ds, c * ds + s * dc
+    return rounding
+
+
+# -------------------------------------------------------------------------------------------- synchronisation
+@njit(nogil=True)
+def _peak_offset(left, mid, right):
+    """Vertex of the parabola through three equidistant values, in steps, within +-1/2."""
+    bend = left - 2.0 * mid + right
+    if bend >= 0.0:
+        return 0.0
+    return min(0.5, max(-0.5, 0.5 * (left - right) / bend))
+
+
+@njit(nogil=True)
+def _search_ca(hist, energy):
+    """Joint search over frequency (+-250 Hz) and bit edge: energies of 9 sums of 20 ms, summed.
+
+    hist: (200, 2) prompts of 1 ms with a fixed NCO. ``energy`` (20,): per bit edge at the best frequency. Returns
+    (frequency error, best energy).
+    """
+    step, half = 10.0, 25
+    prefix = np.empty((HISTORY + 1, 2))
+    table = np.empty((2 * half + 1, 20))
+    best, fb, eb = -1.0, 0, 0
+    for f in range(2 * half + 1):
+        w = _TWO_PI * (f - half) * step * 1e-3
+        dc, ds = math.cos(w), math.sin(w)
+        c, s = 1.0, 0.0
+        prefix[0, 0] = prefix[0, 1] = 0.0
+        for k in range(HISTORY):
+            prefix[k + 1, 0] = prefix[k, 0] + hist[k, 0] * c + hist[k, 1] * s
+            prefix[k + 1, 1] = prefix[k, 1] + hist[k, 1] * c - hist[k, 0] * s
+            c, s = c * dc - s * ds, c * ds + s * dc
+        for e in range(20):
+            total = 0.0
+            for m in range(9):
+                k = e + 20 * m
+                re, im = prefix[k + 20, 0] - prefix[k, 0], prefix[k + 20, 1] - prefix[k, 1]
+                total += re * re + im * im
+            table[f, e] = total
+            if total > best:
+                best, fb, eb = total, f, e
+    for e in range(20):
+        energy[e] = table[fb, e]
+    offset = 0.0
+    if 0 < fb < 2 * half:
+        offset = _peak_offset(table[fb - 1, eb], best, table[fb + 1, eb])
+    return (fb - half + offset) * step, best
+
+
+@njit(nogil=True)
+def _search_pilot(hist, secondary):
+    """Joint search over frequency (+-200 Hz) and secondary-code phase: energies of 2 sums of 25 periods.
+
+    hist: (100, 2) prompts of 2 ms (halves of a period). Returns (frequency error, chip at the first period, best
+    energy, best energy of any other chip).
+    """
+    step, half = 2.5, 80
+    z = np.empty((50, 2))
+    table = np.empty((2 * half + 1, 25))
+    best, fb, sb = -1.0, 0, 0
+    for f in range(2 * half + 1):
+        w = _TWO_PI * (f - half) * step * 2e-3
+        dc, ds = math.cos(w), math.sin(w)
+        c, s = 1.0, 0.0
+        for k in range(100):
+            if k & 1 == 0:
+                z[k >> 1, 0] = z[k >> 1, 1] = 0.0
+            z[k >> 1, 0] += hist[k, 0] * c + hist[k, 1] * s
+            z[k >> 1, 1] += hist[k, 1] * c - hist[k, 0] * s
+            c, s = c * dc - s * ds, c * ds + s * dc
+        for chip in range(25):
+            total = 0.0
+            for m in range(2):
+                re = im = 0.0
+                for k in range(25):
+                    sign = secondary[(chip + k) % 25]
+                    re += sign * z[25 * m + k, 0]
+                    im += sign * z[25 * m + k, 1]
+                total += re * re + im * im
+            table[f, chip] = total
+            if total > best:
+                best, fb, sb = total, f, chip
+    second = 0.0
+    for f in range(2 * half + 1):
+        for chip in range(25):
+            if chip != sb:
+                second = max(second, table[f, chip])
+    offset = 0.0
+    if 0 < fb < 2 * half:
+        offset = _peak_offset(table[fb - 1, sb], best, table[fb + 1, sb])
+    return (fb - half + offset) * step, sb, best, second
+
+
+@njit(nogil=True)
+def _search_data(hist):
+    """Frequency from the phase between the halves of each 4 ms symbol (+-250 Hz): arg of sum h2 conj(h1).
+
+    Returns (frequency error, |sum|).
+    """
+    re = im = 0.0
+    for k in range(50):
+        i1, q1, i2, q2 = hist[2 * k, 0], hist[2 * k, 1], hist[2 * k + 1, 0], hist[2 * k + 1, 1]
+        re += i1 * i2 + q1 * q2
+        im += i1 * q2 - i2 * q1
+    return math.atan2(im, re) / (_TWO_PI * 2e-3), math.hypot(re, im)
+
+
+@njit(nogil=True)
+def _reset_moments(st):
+    st.p2_ema = st.i2_ema = st.i4_ema = st.moment_n = 0.0
+    st.lock_diff = st.lock_sum = st.lock_el = st.lock_n = 0.0
+    st.half_i = st.half_q = st.half_n = 0.0
+    st.bump_ve = st.bump_p = st.bump_vl = st.bump_n = 0.0
+
+
+@njit(nogil=True)
+def _close_loops(st, sample):
+    """Symbols are aligned: from here on the loops run at the settling bandwidths."""
+    st.state = STATE_LOCKED
+    st.settling = 1
+    st.locked_time_s = 0.0
+    st.phase_locked = 0
+    st.bad_s = 0.0
+    st.rate_hz, st.rate_hz_s, st.code_rate_chips_s = st.doppler_hz, 0.0, 0.0
+    st.symbol_m, st.symbol_n = 0, 0
+    st.symbol_i = st.symbol_q = 0.0
+    _reset_moments(st)
+
+
+@njit(nogil=True)
+def _retry(st, limit):
+    st.attempts += 1
+    if st.attempts > limit and st.steered == 0:
+        st.state = STATE_LOST
+
+
+@njit(nogil=True)
+def _set_frequency(st, error_hz):
+    if st.steered == 0:
+        st.doppler_hz += error_hz
+        st.rate_hz = st.doppler_hz
+
+
+@njit(nogil=True)
+def _synchronise(st, hist, secondary, noise):
+    """Use a full history: find the frequency and the symbol (or secondary-code) edge, or try again.
+
+    noise: power of a prompt of one code period. Thresholds: the sums of noise alone exceed them with less than 1e-5
+    (chi-square of 18 degrees of freedom, about 150 independent cells; of 4, about 4000; the mean of 50 products).
+    """
+    st.hist_n = 0
+    if _bump_decision(st, 1.5):
+        return
+    if st.kind == KIND_CA:
+        energy = np.empty(20)
+        f, best = _search_ca(hist, energy)
+        if best < 4.0 * 180.0 * noise:
+            st.state = STATE_PULL_IN
+            st.bit_energy[:] = 0.0
+            _retry(st, 5)
+            return
+        st.state = STATE_BIT_SYNC
+        _set_frequency(st, f)
+        top, second, edge = -1.0, -1.0, 0
+        for e in range(20):
+            k = (st.hist_period + e) % 20
+            st.bit_energy[k] += energy[e]
+        for k in range(20):
+            x = st.bit_energy[k]
+            if x > top:
+                second, top, edge = top, x, k
+            elif x > second:
+                second = x
+        # Neighbouring edges share 19 of 20 prompts per sum; the noise of their difference has variance
+        # 4 |S|^2 noise per sum. Four standard deviations between the first and the second decide.
+        if top - second > 4.0 * math.sqrt(4.0 * top * noise):
+            st.symbol_phase = edge
+            _close_loops(st, st.next_sample)
+        else:
+            _retry(st, 20)
+    elif st.kind == KIND_PILOT:
+        f, chip, best, second = _search_pilot(hist, secondary)
+        if best < 25.0 * 25.0 * noise or best < 1.5 * second:
+            _retry(st, 5)
+            return
+        _set_frequency(st, f)
+        st.symbol_phase = (chip - st.hist_period) % 25
+        _close_loops(st, st.next_sample)
+    else:
+        f, magnitude = _search_data(hist)
+        # Products of halves: variance of the mean of 50, each half with power 2 noise.
+        if magnitude < 4.0 * math.sqrt(50.0) * 2.0 * noise:
+            _retry(st, 5)
+            return
+        _set_frequency(st, f)
+        st.symbol_phase = 0
+        _close_loops(st, st.next_sample)
+
+
+@njit(nogil=True)
+def _bump_decision(st, ratio):
+    """Jump to the very-early or very-late tap where it holds ``ratio`` times the prompt's power.
+
+    The side peaks of BOC(1,1) are half a chip from the main one with a quarter of its power and the opposite sign
+    (bump jumping: Fine & Wilson, ION NTM 1999).
+    """
+    if st.very_early < 0 or st.steered != 0:
+        return False
+    jump = 0.0
+    if st.bump_ve > ratio * st.bump_p and st.bump_ve > st.bump_vl:
+        jump = st.very_offset_chips
+    elif st.bump_vl > ratio * st.bump_p:
+        jump = -st.very_offset_chips
+    st.bump_ve = st.bump_p = st.bump_vl = st.bump_n = 0.0
+    if jump == 0.0:
+        return False
+    st.code_phase_chips += jump
+    st.jumps += 1
+    if st.carrier_code == FOUR_QUADRANT:
+        st.carrier_cycles += 0.5
+    _reset_moments(st)
+    return True
+
+
+# ------------------------------------------------------------------------------------------------------ loops
+@njit(nogil=True)
+def _begin(st, command, fs_hz):
+    """Start an integration: apply steering, choose the number of code periods."""
+    st.steered = 0
+    if command.steered != 0 and st.next_sample >= np.int64(command.sample_index):
+        dt = (st.next_sample - np.int64(command.sample_index)) / fs_hz
+        rate = command.doppler_rate_hz_s
+        mean_doppler = command.doppler_hz + 0.5 * rate * dt
+        phase = command.code_phase_chips + dt * CHIP_RATE_HZ * (1.0 + mean_doppler / F_L1_HZ)
+        length = st.code_length_chips
+        shift = phase - st.code_phase_chips
+        shift -= math.floor(shift / length + 0.5) * length
+        st.code_phase_chips += shift
+        st.doppler_hz = command.doppler_hz + rate * dt
+        st.doppler_rate_hz_s = rate
+        st.rate_hz, st.rate_hz_s, st.code_rate_chips_s = st.doppler_hz, 0.0, 0.0
+        st.steered = 1
+    else:
+        st.doppler_rate_hz_s = 0.0
+    m = 1
+    if st.state == STATE_LOCKED:
+        m = st.m_settle if st.settling else st.m_track
+        if st.kind == KIND_CA:
+            m -= (st.code_period - st.symbol_phase) % m
+    st.m_total, st.m_done, st.n_acc = m, 0, 0
+    st.start_sample, st.start_period = st.next_sample, st.code_period
+    st.start_code_chips, st.start_carrier_cycles = st.code_phase_chips, st.carrier_cycles
+    st.start_doppler_hz = st.doppler_hz
+    st.rounding_sum = st.second_i = st.second_q = st.data_i = st.data_q = 0.0
+
+
+@njit(nogil=True)
+def _pull_in_code(st, e, late, noise):
+    """DLL of one code period before synchronisation: power discriminator over a smoothed, noise-free norm."""
+    e2, l2 = e.real * e.real + e.imag * e.imag, late.real * late.real + late.imag * late.imag
+    st.el_n = min(st.el_n + 1.0, 20.0)
+    st.el_ema += (e2 + l2 - st.el_ema) / st.el_n
+    norm = max(st.el_ema - 2.0 * noise, 0.3 * st.el_ema)
+    if norm <= 0.0:
+        return 0.0
+    return min(0.3, max(-0.3, (e2 - l2) / norm * st.pull_scale_chips))
+
+
+@njit(nogil=True)
+def _smooth(st, p, e2l2, ve2, vl2, T_s):
+    """Running moments: plain means at first, exponential windows later."""
+    i2, q2 = p.real * p.real, p.imag * p.imag
+    st.moment_n = min(st.moment_n + 1.0, max(20.0, st.cn0_window_s / T_s))
+    g = 1.0 / st.moment_n
+    st.p2_ema += (i2 + q2 - st.p2_ema) * g
+    st.i2_ema += (i2 - st.i2_ema) * g
+    st.i4_ema += (i2 * i2 - st.i4_ema) * g
+    st.lock_n = min(st.lock_n + 1.0, max(5.0, 0.25 / T_s))
+    g = 1.0 / st.lock_n
+    st.lock_diff += (i2 - q2 - st.lock_diff) * g
+    st.lock_sum += (i2 + q2 - st.lock_sum) * g
+    st.lock_el += (e2l2 - st.lock_el) * g
+    st.bump_ve += ve2
+    st.bump_p += i2 + q2
+    st.bump_vl += vl2
+    st.bump_n += 1.0
+
+
+@njit(nogil=True)
+def _update_lock(st, noise, T_s, fs_hz, phase_error):
+    """C/N0, lock indicators with hysteresis, cycle-slip flag. Returns the flag."""
+    n = st.n_acc
+    # An exponential window of gain g has the variance of 2 / g - 1 independent values.
+    n_noise = 2.0 * st.noise_n - 1.0
+    st.cn0_dbhz = cn0_noise_reference_dbhz(st.p2_ema, n, st.noise_ema, n_noise, fs_hz)
+    st.cn0_prompt_dbhz = cn0_moments_dbhz(st.i2_ema, st.i4_ema, 2.0 * st.moment_n - 1.0, T_s)
+    st.carrier_lock = carrier_lock(st.lock_diff, st.lock_sum, noise)
+    st.code_lock = code_lock(st.lock_el, st.lock_sum, noise, st.r_half)
+    slip = 0
+    if st.phase_locked:
+        if st.carrier_lock < st.lock_out:
+            st.phase_locked = 0
+            slip = 1
+        elif abs(phase_error) > (0.4 if st.carrier_code == FOUR_QUADRANT else 0.2):
+            slip = 1
+    elif st.carrier_lock > st.lock_in and st.lock_n * T_s >= 0.1 and st.lock_n >= 5.0:
+        st.phase_locked = 1
+        st.lock_start_sample = st.next_sample
+    bad = st.carrier_lock < st.lock_out or st.cn0_dbhz < st.cn0_min_dbhz
+    if bad and (st.lock_n >= 5.0):
+        st.bad_s += T_s
+    else:
+        st.bad_s = max(0.0, st.bad_s - T_s)
+    if st.bad_s > st.lost_after_s and st.steered == 0:
+        st.state = STATE_LOST
+        st.phase_locked = 0
+    st.slips += slip
+    return slip
+
+
+@njit(nogil=True)
+def _false_frequency(st, i1, q1, i2, q2, T_s):
+    """A Costas loop also settles at multiples of 1 / (2 T): the halves of the integration show it; jump back."""
+    st.half_n = min(st.half_n + 1.0, max(10.0, 0.3 / T_s))
+    g = 1.0 / st.half_n
+    st.half_i += (i1 * i2 + q1 * q2 - st.half_i) * g
+    st.half_q += (i1 * q2 - i2 * q1 - st.half_q) * g
+    if st.half_n < 10.0 or st.steered != 0:
+        return False
+    f = math.atan2(st.half_q, st.half_i) / (_TWO_PI * 0.5 * T_s)
+    if abs(f) < 0.3 / T_s or math.hypot(st.half_i, st.half_q) < 0.1 * st.lock_sum:
+        return False
+    st.rate_hz += f
+    st.doppler_hz = st.rate_hz
+    st.rate_hz_s = 0.0
+    st.settling, st.locked_time_s = 1, 0.0
+    _reset_moments(st)
+    return True
+
+
+@njit(nogil=True)
+def _steer(st, phase_error, freq_error, code_err, T_s):
+    """Loop filters of one integration (equations in ``loops.py``)."""
+    k = st.pll_settle if st.settling else st.pll_track
+    fll = st.fll_settle if st.settling else st.fll_track
+    st.rate_hz_s += k[2] * phase_error / (T_s * T_s)
+    st.rate_hz += k[1] * phase_error / T_s + st.rate_hz_s * T_s + fll * freq_error
+    st.doppler_hz = st.rate_hz + k[0] * phase_error / T_s
+    if st.settling:
+        st.code_phase_chips += st.dll_settle * code_err
+    else:
+        st.code_rate_chips_s += st.dll_track[1] * code_err / T_s
+        st.code_phase_chips += st.dll_track[0] * code_err + 0.0
+
+
+@njit(nogil=True)
+def _tap(acc, t, norm):
+    return complex(acc[2 * t] * norm, acc[2 * t + 1] * norm)
+
+
+@njit(nogil=True)
+def _finish(st, acc, hist, secondary, fs_hz, epoch, corr):
+    """End of an integration: discriminators, loops, lock; fills the EPOCH record and its correlator row."""
+    n = st.n_acc
+    norm = st.scale / n
+    T_s = st.m_total * st.period_s
+    p, e, late = _tap(acc, st.prompt, norm), _tap(acc, st.early, norm), _tap(acc, st.late, norm)
+    ve = vl = complex(0.0, 0.0)
+    if st.very_early >= 0:
+        ve, vl = _tap(acc, st.very_early, norm), _tap(acc, st.very_late, norm)
+    i2, q2 = st.second_i * norm, st.second_q * norm
+    i1, q1 = p.real - i2, p.imag - q2
+    rounding = st.rounding_sum / n
+    noise = st.noise_ema / n
+    state = st.state
+    phase_error = carrier_error_cycles(st.carrier_code, p.real, p.imag)
+    freq_error = frequency_error_hz(i1, q1, i2, q2, 0.5 * T_s)
+    slip = 0
+    doppler_used, rate_used = st.start_doppler_hz, st.doppler_rate_hz_s
+    _smooth(
+        st,
+        p,
+        e.real**2 + e.imag**2 + late.real**2 + late.imag**2,
+        ve.real**2 + ve.imag**2,
+        vl.real**2 + vl.imag**2,
+        T_s,
+    )
+    if state == STATE_LOCKED:
+        code = st.code_code
+        if code == COHERENT and st.phase_locked == 0:
+            code = 0
+        code_err = code_error(code, ve, e, p, late, vl) * st.code_scale_chips + rounding
+        slip = _update_lock(st, noise, T_s, fs_hz, phase_error)
+        if st.steered == 0 and st.state == STATE_LOCKED:
+            _steer(st, phase_error, freq_error, code_err, T_s)
+            _false_frequency(st, i1, q1, i2, q2, T_s)
+            if st.bump_n * T_s >= 0.1 and st.bump_n >= 4.0 and _bump_decision(st, 1.5):
+                slip = 1
+        st.locked_time_s += T_s
+        if st.settling and st.locked_time_s > st.settle_s and st.phase_locked:
+            st.settling = 0
+            _reset_moments(st)
+    else:
+        code_err = _pull_in_code(st, e, late, noise) + rounding
+        if st.steered == 0:
+            st.code_phase_chips += st.dll_pull * code_err
+        st.cn0_dbhz = cn0_noise_reference_dbhz(st.p2_ema, n, st.noise_ema, 2.0 * st.noise_n - 1.0, fs_hz)
+        if st.hist_n == 0:
+            st.hist_period = st.start_period
+        if st.kind == KIND_CA:
+            hist[st.hist_n, 0], hist[st.hist_n, 1] = p.real, p.imag
+            st.hist_n += 1
+        else:
+            hist[st.hist_n, 0], hist[st.hist_n, 1] = i1, q1
+            hist[st.hist_n + 1, 0], hist[st.hist_n + 1, 1] = i2, q2
+            st.hist_n += 2
+        if st.hist_n >= (HISTORY if st.kind == KIND_CA else HISTORY // 2):
+            _synchronise(st, hist, secondary, noise)
+    for t in range(st.n_taps):
+        corr[t] = np.complex64(_tap(acc, t, norm))
+    epoch.sample_index = st.start_sample
+    epoch.n_samples = n
+    epoch.prn = st.prn
+    epoch.state = state
+    epoch.symbol_index = st.start_period
+    epoch.tow_s = math.nan
+    epoch.code_phase_chips = st.start_code_chips
+    epoch.carrier_phase_cycles = st.start_carrier_cycles
+    epoch.doppler_hz = doppler_used
+    epoch.doppler_rate_hz_s = rate_used
+    epoch.code_rate_hz = CHIP_RATE_HZ * (1.0 + doppler_used / F_L1_HZ) + st.code_rate_chips_s
+    epoch.prompt_i, epoch.prompt_q = p.real, p.imag
+    epoch.prompt2_i, epoch.prompt2_q = i2, q2
+    epoch.data_i, epoch.data_q = st.data_i * st.data_scale / n, st.data_q * st.data_scale / n
+    noise_tap = _tap(acc, st.n_taps, norm)
+    epoch.noise_i, epoch.noise_q = noise_tap.real, noise_tap.imag
+    epoch.noise_power = noise
+    epoch.code_error_chips = code_err
+    epoch.phase_error_cycles = phase_error
+    epoch.freq_error_hz = freq_error
+    epoch.cn0_dbhz = st.cn0_dbhz
+    epoch.cn0_prompt_dbhz = st.cn0_prompt_dbhz
+    epoch.carrier_lock = st.carrier_lock
+    epoch.code_lock = st.code_lock
+    epoch.cycle_slip = slip
+
+
+@njit(nogil=True)
+def _symbols(st, sums, n, start_sample, out, count):
+    """Collect data symbols from one code period; returns the new count."""
+    if st.state != STATE_LOCKED:
+        return count
+    t = st.n_taps + 1 if st.kind == KIND_PILOT else st.prompt
+    scale = st.data_scale if st.kind == KIND_PILOT else st.scale
+    length = 20 if st.kind == KIND_CA else 1
+    if st.kind == KIND_CA and (st.code_period - st.symbol_phase) % 20 == 0:
+        st.symbol_m = 0
+        st.symbol_i = st.symbol_q = 0.0
+        st.symbol_n = 0
+        st.symbol_start, st.symbol_period = start_sample, st.code_period
+    elif st.kind == KIND_CA and st.symbol_n == 0:
+        return count  # joined in the middle of a bit
+    if st.kind != KIND_CA:
+        st.symbol_m, st.symbol_n = 0, 0
+        st.symbol_i = st.symbol_q = 0.0
+        st.symbol_start, st.symbol_period = start_sample, st.code_period
+    st.symbol_i += sums[2 * t]
+    st.symbol_q += sums[2 * t + 1]
+    st.symbol_n += n
+    st.symbol_m += 1
+    if st.symbol_m < length or count >= len(out):
+        return count
+    row = out[count]
+    row.sample_index = st.symbol_start
+    row.code_period = st.symbol_period
+    row.soft = st.symbol_i * scale / st.symbol_n
+    row.soft_q = st.symbol_q * scale / st.symbol_n
+    st.symbol_n = 0
+    return count + 1
+
+
+@njit(nogil=True)
+def _accumulate(st, acc, sums, n, sign):
+    """Add one code period to the integration and to the noise estimate."""
+    n_sums = st.n_sums
+    for k in range(2 * st.n_taps + 2):
+        acc[k] += sign * sums[k]
+    if n_sums > st.n_taps + 1:
+        st.data_i += sums[2 * st.n_taps + 2]
+        st.data_q += sums[2 * st.n_taps + 3]
+    noise_i, noise_q = sums[2 * st.n_taps] * st.scale, sums[2 * st.n_taps + 1] * st.scale
+    st.noise_n = min(st.noise_n + 1.0, st.cn0_window_s / st.period_s)
+    st.noise_ema += ((noise_i * noise_i + noise_q * noise_q) / n - st.noise_ema) / st.noise_n
+    if 2 * st.m_done + 1 == st.m_total:
+        st.second_i += sign * sums[2 * n_sums]
+        st.second_q += sign * sums[2 * n_sums + 1]
+    elif 2 * st.m_done >= st.m_total:
+        st.second_i += sign * sums[2 * st.prompt]
+        st.second_q += sign * sums[2 * st.prompt + 1]
+
+
+@njit(cache=True, nogil=True)
+def track_slab(which, xi, xq, first, n_avail, fs_hz, if_hz, pool, tap_q, secondary, ch, acc, hist, commands, epochs,
+               counts, corr, symbols, symbol_counts):  # fmt: skip
+    """Take the channels ``which`` through every whole code period of the samples.
+
+    Parameters
+    ----------
+    which : int64 (W,)
+        Channels to run.
+    xi, xq : int8 | int16 | float32 (>= n_avail,)
+        Samples ``first`` .. ``first + n_avail - 1``.
+    pool : int8 (n,)
+        All code tables, row after row.
+    tap_q : int64 (C, K + 2)
+        Tap offsets in 1/P samples: taps, noise reference, data prompt.
+    secondary : float64 (25,)
+        CS25_1, +-1.
+    ch : CHANNEL (C,)
+        State, changed in place; with ``acc`` float64 (C, 2 K + 4) and ``hist`` float64 (C, HISTORY, 2).
+    commands : AIDING (C,)
+    epochs : EPOCH (C, n_max); corr : complex64 (C, n_max, K); symbols : SYMBOL (C, n_max)
+        Outputs; ``counts`` and ``symbol_counts`` int64 (C,) say how many rows are filled.
+    """
+    n_columns = tap_q.shape[1]
+    ct, sn = np.empty(_BLOCK, np.float32), np.empty(_BLOCK, np.float32)
+    wi, wq = np.empty(_BLOCK, np.float32), np.empty(_BLOCK, np.float32)
+    starts = np.zeros(n_columns + 8, np.uint64)
+    out = np.zeros(2 * n_columns + 16, np.float32)
+    sums = np.zeros(2 * n_columns + 4)
+    end = first + n_avail
+    if_step = if_hz / fs_hz
+    for c in which:
+        st = ch[c]
+        k, n_symbols = 0, 0
+        table_hz = math.nan
+        starts[:] = _U(st.table_start)
+        while STATE_PULL_IN <= st.state <= STATE_LOCKED and k < epochs.shape[1]:
+            if st.m_done == 0:
+                if st.n_acc == 0:
+                    _begin(st, commands[c], fs_hz)
+                    acc[c, :] = 0.0
+            rough = st.doppler_hz
+            if st.doppler_rate_hz_s != 0.0:
+                rough += st.doppler_rate_hz_s * (
+                    (st.next_sample - st.start_sample) / fs_hz + 0.5 * st.period_s
+                )
+            rate = (CHIP_RATE_HZ * (1.0 + rough / F_L1_HZ) + st.code_rate_chips_s) / fs_hz
+            n = np.int64(math.ceil((st.code_length_chips - st.code_phase_chips) / rate))
+            if st.next_sample + n > end:
+                break
+            if rough != table_hz:
+                _carrier_table((if_hz + rough) / fs_hz, ct, sn)
+                table_hz = rough
+            turns = if_step * st.next_sample
+            theta = turns - math.floor(turns) + st.carrier_cycles
+            theta -= math.floor(theta)
+            sign = 1.0
+            if st.kind == KIND_PILOT and st.state == STATE_LOCKED:
+                sign = secondary[(st.code_period + st.symbol_phase) % 25]
+            rounding = _correlate_period(
+                st, xi, xq, st.next_sample - first, n, theta, (if_hz + rough) / fs_hz, rate, ct, sn, pool, tap_q[c],
+                starts, wi, wq, out, sums,
+            )  # fmt: skip
+            st.rounding_sum += rounding
+            _accumulate(st, acc[c], sums, n, sign)
+            n_symbols = _symbols(st, sums, n, st.next_sample, symbols[c], n_symbols)
+            st.m_done += 1
+            st.n_acc += n
+            st.next_sample += n
+            st.code_period += 1
+            st.code_phase_chips += n * rate - st.code_length_chips
+            st.carrier_cycles += rough * n / fs_hz
+            if st.m_done >= st.m_total:
+                if st.doppler_rate_hz_s != 0.0:
+                    st.doppler_hz += st.doppler_rate_hz_s * st.n_acc / fs_hz
+                _finish(st, acc[c], hist[c], secondary, fs_hz, epochs[c, k], corr[c, k])
+                st.m_done, st.n_acc = 0, 0
+                k += 1
+        counts[c] = k
+        symbol_counts[c] = n_symbols
