@@ -1,8 +1,8 @@
 """Ionosphere and troposphere as group delays: the code arrives late by them, the carrier early by the first.
 
-The models are those that GNSS-SDR and RTKLIB apply as iono_model = Broadcast and trop_model = Saastamoinen, so
-that their fixes agree with ours. Galileo satellites use Klobuchar too, in scenario and receiver alike: NeQuick is
-not modelled, its ai0..ai2 only travel in the message.
+The models are those that GNSS-SDR and RTKLIB apply as iono_model = Broadcast and trop_model = Saastamoinen,
+so that their fixes agree with ours. Galileo satellites use Klobuchar too, in scenario and receiver: NeQuick
+is not modelled, its ai0..ai2 only travel in the message.
 """
 
 import numpy as np
@@ -51,7 +51,7 @@ def klobuchar(
 ) -> np.ndarray:
     """Ionospheric group delay on L1 in s, broadcast over the inputs (IS-GPS-200, 20.3.3.5.2.5).
 
-    ``tow_s`` is GPS time of week or of day. ``alpha``, ``beta`` are the four coefficients each, s/semicircle^n.
+    ``tow_s`` is GPS time of week or of day; ``alpha``, ``beta`` hold four coefficients each, s/semicircle^n.
     """
     columns, shape = _flat(lat_rad, lon_rad, azimuth_rad, elevation_rad, tow_s)
     out = np.empty(columns[0].size)
@@ -61,7 +61,7 @@ def klobuchar(
 
 
 def saastamoinen(lat_rad, height_m, elevation_rad, humidity: float = RELATIVE_HUMIDITY) -> np.ndarray:
-    """Tropospheric slant delay in m, broadcast over the inputs; the standard atmosphere is evaluated at height."""
+    """Tropospheric slant delay in m, broadcast over the inputs; standard atmosphere at the height."""
     columns, shape = _flat(lat_rad, height_m, elevation_rad)
     out = np.empty(columns[0].size)
     _saastamoinen_array(*columns, float(humidity), out)

@@ -1,7 +1,7 @@
 """Receiver clock: bias and drift of its reading, with the frequency noise of common oscillators.
 
-The bias is a function of the *reading* t_r = sample index / fs: true time = t_r - bias(t_r). So the truth at a
-sample needs no iteration, and it is what a receiver's solution at that sample estimates.
+The bias is a function of the *reading* t_r = sample index / fs: true time = t_r - bias(t_r). So the truth at
+a sample needs no iteration, and it is what a receiver's solution at that sample estimates.
 """
 
 import math
@@ -18,9 +18,9 @@ OSCILLATORS = {
 }
 """h0 (s) and h-2 (1/s) of the one-sided fractional-frequency spectrum S_y(f) = h0 + h-2 / f^2.
 
-TCXO and OCXO: Brown and Hwang, Introduction to Random Signals and Applied Kalman Filtering (1997), table 10.2
-("compensated crystal", "ovenized crystal"). CSAC: h0 = 2 tau ADEV^2 from 3e-10 at 1 s (data sheet class); its h-2
-is assumed.
+TCXO and OCXO: Brown and Hwang, Introduction to Random Signals and Applied Kalman Filtering (1997), table
+10.2 ("compensated crystal", "ovenized crystal"). CSAC: h0 = 2 tau ADEV^2 from 3e-10 at 1 s (data sheet);
+its h-2 is assumed.
 """
 CLOCK_STEP_S = 0.02
 """Grid of the noise. Nodes at multiples of it reproduce the interpolated bias exactly."""

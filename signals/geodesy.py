@@ -38,28 +38,22 @@ def ecef_to_geodetic(pos_ecef_m) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return lat, np.arctan2(y, x), height
 
 
-def ned_to_ecef_matrix(lat_rad, lon_rad) -> np.ndarray:
-    """Rotation C_en (..., 3, 3): columns are the north, east and down unit vectors in the ECEF frame."""
+def ned_matrix(lat_rad, lon_rad) -> np.ndarray:
+    """Rotation C_ne (..., 3, 3) from ECEF into north-east-down; its rows are the unit vectors in ECEF."""
     lat, lon = np.broadcast_arrays(np.asarray(lat_rad, float), np.asarray(lon_rad, float))
     sin_lat, cos_lat, sin_lon, cos_lon = np.sin(lat), np.cos(lat), np.sin(lon), np.cos(lon)
-    zero = np.zeros_like(lat)
     rows = [
-        [-sin_lat * cos_lon, -sin_lon, -cos_lat * cos_lon],
-        [-sin_lat * sin_lon, cos_lon, -cos_lat * sin_lon],
-        [cos_lat, zero, -sin_lat],
+        [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat],
+        [-sin_lon, cos_lon, np.zeros_like(lat)],
+        [-cos_lat * cos_lon, -cos_lat * sin_lon, -sin_lat],
     ]
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-
-
-def ecef_to_ned_matrix(lat_rad, lon_rad) -> np.ndarray:
-    """Rotation C_ne (..., 3, 3) from ECEF into north-east-down, the transpose of `ned_to_ecef_matrix`."""
-    return np.swapaxes(ned_to_ecef_matrix(lat_rad, lon_rad), -1, -2)
 
 
 def elevation_azimuth(pos_ecef_m, target_ecef_m) -> tuple[np.ndarray, np.ndarray]:
     """Elevation and azimuth (rad, azimuth from north through east in [0, 2 pi)) of targets (..., 3)."""
     lat, lon, _ = ecef_to_geodetic(pos_ecef_m)
     line = np.asarray(target_ecef_m, float) - np.asarray(pos_ecef_m, float)
-    ned = np.einsum("...ij,...j->...i", ecef_to_ned_matrix(lat, lon), line)
+    ned = np.einsum("...ij,...j->...i", ned_matrix(lat, lon), line)
     north, east, down = np.moveaxis(ned, -1, 0)
     return np.arctan2(-down, np.hypot(north, east)), np.mod(np.arctan2(east, north), 2.0 * np.pi)

@@ -1,7 +1,7 @@
 """Kernels of the geometry chain: broadcast orbit, atmosphere, light time. One module, so one on-disk cache.
 
-Everything here is per satellite and per instant, plain arrays and scalars in, float64 throughout, no fastmath:
-the delay (0.07 s) has to hold micrometres.
+Everything here is per satellite and per instant, plain arrays and scalars in, float64 throughout, no
+fastmath: the delay (0.07 s) has to hold micrometres.
 """
 
 import math
@@ -46,7 +46,7 @@ _TAU0_S = 0.075
 
 @njit(cache=True, nogil=True)
 def orbit_kernel(k, dt_toe_s, dt_toc_s):
-    """Satellite position, velocity and clock from broadcast elements (IS-GPS-200, table 20-IV and its derivatives).
+    """Satellite position, velocity and clock from broadcast elements (IS-GPS-200, table 20-IV, derived).
 
     Parameters
     ----------
@@ -145,10 +145,10 @@ def klobuchar_kernel(lat_rad, lon_rad, azimuth_rad, elevation_rad, tow_s, alpha,
 
 @njit(cache=True, nogil=True)
 def saastamoinen_kernel(lat_rad, height_m, elevation_rad, humidity):
-    """Slant delay of the troposphere in m: standard atmosphere, Saastamoinen zenith delays over sin(elevation).
+    """Slant delay of the troposphere in m: standard atmosphere, Saastamoinen zenith delay over sin(el).
 
     Hydrostatic 0.0022768 P / (1 - 0.00266 cos 2 lat - 0.00028 h_km), wet 0.002277 (1255 / T + 0.05) e
-    (RTKLIB manual 2.4.2, E.5 (1)-(4)). Where RTKLIB returns zero (above 10 km) the standard atmosphere goes on.
+    (RTKLIB manual 2.4.2, E.5 (1)-(4)). Above 10 km, where RTKLIB returns zero, the atmosphere goes on.
     """
     h = max(height_m, 0.0)
     base = 1.0 - 2.2557e-5 * h

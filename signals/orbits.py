@@ -1,7 +1,7 @@
 """Broadcast orbits and clocks, and the constellations that are built in.
 
-Time is given as ``(week, tow_s, t_s)``: an epoch at a whole second and small seconds from it, so that nothing is
-lost to the float64 grid of an absolute time (30 ns at a time of week would be 0.1 mm of orbit, 1e-4 chip).
+Time is given as ``(week, tow_s, t_s)``: an epoch at a whole second and small seconds from it, so that nothing
+is lost to the float64 grid of an absolute time (1e-10 s, 3 cm of range, at a time of week).
 """
 
 import math
@@ -37,7 +37,7 @@ _HALF_WEEK = SECONDS_PER_WEEK // 2
 
 
 def seconds_from(ephemeris: np.ndarray, field: str, week: int, tow_s: float) -> np.ndarray:
-    """Seconds from ``field`` ("toe_s" or "toc_s") to (week, tow_s), wrapped to +-302400 (table 20-IV, footnote)."""
+    """Seconds from ``field`` ("toe_s" or "toc_s") to (week, tow_s), wrapped to +-302400 (table 20-IV)."""
     dt = (week - ephemeris["week"].astype(float)) * SECONDS_PER_WEEK + (tow_s - ephemeris[field])
     return np.mod(dt + _HALF_WEEK, SECONDS_PER_WEEK) - _HALF_WEEK
 
@@ -114,7 +114,7 @@ def check_ephemeris(ephemeris: np.ndarray) -> None:
                 )
 
 
-# --- message resolution -------------------------------------------------------------------------------------
+# --- message resolution ----------------------------------------------------------------------------------
 
 _COMMON_LSB = {
     "sqrt_a_sqrt_m": 2.0**-19,
@@ -160,10 +160,10 @@ def quantise_ephemeris(ephemeris: np.ndarray) -> np.ndarray:
     return out
 
 
-# --- nominal constellations -----------------------------------------------------------------------------------
+# --- nominal constellations ------------------------------------------------------------------------------
 
-# Reference slots of the GPS SPS Performance Standard (2020), table 3.2-1: argument of latitude in deg per plane
-# at 1993-07-01 00:00 UTC; the nodes are 60 deg apart from 272.847 deg.
+# Reference slots of the GPS SPS Performance Standard (2020), table 3.2-1: argument of latitude in deg per
+# plane at 1993-07-01 00:00 UTC; the nodes are 60 deg apart from 272.847 deg.
 _GPS_SLOTS_DEG = (
     (268.126, 161.786, 11.676, 41.806),
     (80.956, 173.336, 309.976, 204.376),
@@ -176,8 +176,8 @@ _GPS_SLOTS_DEG = (
 _GPS_SPARES_DEG = ((100.0, 325.0), (20.0,), (175.0,), (310.0,), (130.0,), (55.0,))
 _GPS_EPOCH_S = (704 * 7 + 4) * 86_400.0  # 1993-07-01 after 1980-01-06
 _GPS_NODE_DEG = 272.847
-# Galileo reference constellation (European GNSS Service Centre, orbital and technical parameters): Walker 24/3/1
-# at 2016-11-21 00:00 UTC.
+# Galileo reference constellation (European GNSS Service Centre, orbital and technical parameters): Walker
+# 24/3/1 at 2016-11-21 00:00 UTC.
 _GALILEO_EPOCH_S = (1924 * 7 + 1) * 86_400.0
 _GALILEO_NODE_DEG = 317.632
 _GALILEO_U_DEG = 225.153
@@ -208,7 +208,8 @@ def _spread(prn: np.ndarray, index: int) -> np.ndarray:
     return 2.0 * np.mod(prn * 0.6180339887498949 + index * 0.7548776662466927, 1.0) - 1.0
 
 
-_SECULAR = {  # a_m, i_deg, e_max, node drift rad/s, mean-motion correction rad/s (oblateness), af0 s, TGD/BGD s
+# a_m, i_deg, e_max, node drift rad/s, mean-motion correction rad/s (oblateness), af0 s, TGD or BGD s
+_SECULAR = {
     "G": (26_559_710.0, 55.0, 0.015, -8.0e-9, 4.6e-9, 4.0e-4, (-2.0e-9, 1.0e-8)),
     "E": (29_600_000.0, 56.0, 0.0005, -5.5e-9, 2.8e-9, 6.0e-4, (0.0, 6.0e-9)),
 }
@@ -217,9 +218,9 @@ _SECULAR = {  # a_m, i_deg, e_max, node drift rad/s, mean-motion correction rad/
 def nominal_constellation(system: str, week: int, tow_s: int) -> np.ndarray:
     """Healthy, deterministic EPHEMERIS records, toe within the last 20 min before the epoch.
 
-    GPS: the 24 reference slots and seven spares, PRN 1-31. Galileo: Walker 24/3/1, a = 29600 km, i = 56 deg,
-    PRN 1-24. Eccentricities, harmonics, clocks and group delays are of realistic size, differ by satellite and
-    are multiples of the message resolution.
+    GPS: the 24 reference slots and seven spares, PRN 1-31. Galileo: Walker 24/3/1, a = 29600 km, i = 56
+    deg, PRN 1-24. Eccentricities, harmonics, clocks and group delays are of realistic size, differ by
+    satellite and are multiples of the message resolution.
 
     Sources: GPS SPS Performance Standard (2020), table 3.2-1; European GNSS Service Centre, constellation
     parameters. Shapes and clocks are assumed.

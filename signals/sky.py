@@ -9,18 +9,20 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from signals.atmosphere import RELATIVE_HUMIDITY
 from signals.clock import Clock
-from signals.constants import C_MPS, F_L1_HZ
+from signals.constants import C_MPS
 from signals.geometry_kernels import propagate_kernel
 from signals.orbits import (
     check_ephemeris,
     default_iono_utc,
     nominal_constellation,
     orbit_coefficients,
+    quantise_ephemeris,
     seconds_from,
 )
 from signals.records import EPHEMERIS, PVT_TRUTH
-from signals.timescale import week_tow
-from signals.trajectory import Motion
+from signals.rinex import read_rinex_nav, select
+from signals.timescale import calendar, week_tow
+from signals.trajectory import Motion, Range, RangeRun
 
 SIGNAL_SYSTEM = {"L1CA": "G", "E1": "E"}
 _MAX_PRN = {"L1CA": 63, "E1": 50}
@@ -31,18 +33,12 @@ _SELECT_STEP_S = 30.0
 _SatId = Annotated[str, Field(pattern=r"^[GE]\d\d$")]
 
 
-class ScriptedSpec(BaseModel):
-    """A satellite without an orbit: constant Doppler and Doppler rate from a given delay.
-
-    delay = delay_s - (doppler t + doppler_rate t^2 / 2) / F_L1 (+ receiver clock), code and carrier alike.
-    """
+class ScriptedSpec(Range):
+    """A satellite without an orbit: its delay follows `Range` (+ receiver clock), code and carrier alike."""
 
     model_config = _FROZEN
     signal: Literal["L1CA", "E1"] = "L1CA"
     prn: int = Field(ge=1, le=63)
-    delay_s: float = Field(default=0.075, ge=0.0, le=10.0)
-    doppler_hz: float = Field(default=0.0, ge=-50e3, le=50e3)
-    doppler_rate_hz_s: float = Field(default=0.0, ge=-2_000.0, le=2_000.0)
     cn0_dbhz: float | None = Field(default=None, ge=0.0, le=80.0)
     elevation_deg: float = Field(default=45.0, ge=0.0, le=90.0)
     azimuth_deg: float = Field(default=0.0, ge=0.0, le=360.0)
@@ -120,8 +116,10 @@ class SkySpec(BaseModel):
         week_tow(value)
         return value
 
-    def start(self, motion: Motion, clock: Clock, duration_s: float) -> "Sky":
+    def start(self, motion: Motion, clock: Clock, duration_s: float, seed=0) -> "Sky":
         """Choose the satellites that rise above the mask within [0, duration_s] and make their `Sky`.
+
+        ``seed`` (int or SeedSequence) is used for the random Dopplers of scripted satellites only.
 
         Raises
         ------
@@ -132,7 +130,8 @@ class SkySpec(BaseModel):
         ephemerides, iono_utc = self._load(week, tow_s)
         ephemerides = self._named(ephemerides)
         check_ephemeris(ephemerides)
-        sky = Sky(self, motion, clock, week, tow_s, iono_utc, self._rows(ephemerides))
+        scripts = self._scripts(np.random.SeedSequence(seed) if isinstance(seed, int) else seed)
+        sky = Sky(self, motion, clock, week, tow_s, iono_utc, self._rows(ephemerides), scripts)
         sky = sky.only(self._chosen(sky, duration_s))
         if not sky.satellites:
             raise ValueError(
@@ -141,12 +140,36 @@ class SkySpec(BaseModel):
             )
         return sky
 
+    def _scripts(self, seeds: np.random.SeedSequence) -> dict[str, tuple[ScriptedSpec, RangeRun]]:
+        """Started ranges by satellite name; each satellite has its own child seed."""
+        out = {}
+        for i, s in enumerate(self.scripted):
+            child = np.random.SeedSequence(seeds.entropy, spawn_key=(*seeds.spawn_key, i))
+            out[f"{SIGNAL_SYSTEM[s.signal]}{s.prn:02d}"] = (s, s.start_range(child))
+        return out
+
     def _load(self, week: int, tow_s: int) -> tuple[np.ndarray, np.ndarray]:
-        systems = sorted({SIGNAL_SYSTEM[s] for s in self.signals}, reverse=True)
-        if self.source == "none":
-            return np.zeros(0, EPHEMERIS), default_iono_utc(week, tow_s)
-        parts = [nominal_constellation(system, week, tow_s) for system in systems]
-        return np.concatenate(parts) if parts else np.zeros(0, EPHEMERIS), default_iono_utc(week, tow_s)
+        """Ephemerides of the wanted systems at the start, and the IONO_UTC record."""
+        systems = [s for s in "GE" if s in {SIGNAL_SYSTEM[signal] for signal in self.signals}]
+        if self.source == "rinex":
+            return self._load_rinex(systems, week, tow_s)
+        parts = [nominal_constellation(s, week, tow_s) for s in systems if self.source == "nominal"]
+        return np.concatenate([np.zeros(0, EPHEMERIS), *parts]), default_iono_utc(week, tow_s)
+
+    def _load_rinex(self, systems: list[str], week: int, tow_s: int) -> tuple[np.ndarray, np.ndarray]:
+        if self.path is None:
+            raise ValueError('sky.path is missing: source = "rinex" needs the path of a navigation file')
+        records, iono_utc = read_rinex_nav(self.path)
+        prns = sorted({int(prn) for prn in records["prn"]})
+        found = [select(records, s, prn, week, tow_s) for s in systems for prn in prns]
+        rows = [record for record in found if record is not None]
+        if not rows:
+            toe = [calendar(r["week"], r["toe_s"]) for r in records]
+            raise ValueError(
+                f"{self.path} has no ephemeris of {', '.join(self.signals)} valid at"
+                f" {self.start_time.isoformat()}: its reference times are {min(toe).isoformat()} to {max(toe).isoformat()}"
+            )
+        return quantise_ephemeris(np.array(rows)), iono_utc
 
     def _named(self, ephemerides: np.ndarray) -> np.ndarray:
         """Keep ``prns``, apply the healths, refuse names that are not there."""
@@ -192,7 +215,8 @@ class SkySpec(BaseModel):
     def _chosen(self, sky: "Sky", duration_s: float) -> np.ndarray:
         """Indices of the satellites seen at any time; the highest ones where ``max_satellites`` is set."""
         t = np.linspace(0.0, duration_s, max(2, int(np.ceil(duration_s / _SELECT_STEP_S)) + 1))
-        highest = np.where(sky.propagate(t).visible, sky.propagate(t).elevation_rad, -np.inf).max(axis=1)
+        seen = sky.propagate(t)
+        highest = np.where(seen.visible, seen.elevation_rad, -np.inf).max(axis=1)
         index = np.flatnonzero(highest > -np.inf)
         if self.max_satellites is not None:
             index = np.sort(index[np.argsort(-highest[index], kind="stable")[: self.max_satellites]])
@@ -211,8 +235,9 @@ class Sky:
     iono_utc: np.ndarray
     """IONO_UTC record of shape (), one for both constellations."""
     satellites: tuple[Satellite, ...]
+    """Those with an orbit first, then the scripted ones."""
+    scripts: dict[str, tuple[ScriptedSpec, RangeRun]]
     _orbits: dict[str, Any] = field(init=False, repr=False)
-    _scripts: tuple[ScriptedSpec, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         with_orbit = [s.ephemeris for s in self.satellites if s.ephemeris is not None]
@@ -226,14 +251,13 @@ class Sky:
             "offset": eph["tgd_s"] - ggto,
         }
         object.__setattr__(self, "_orbits", orbits)
-        scripted = {(SIGNAL_SYSTEM[s.signal], s.prn): s for s in self.spec.scripted}
-        own = tuple(scripted[s.system, s.prn] for s in self.satellites if s.ephemeris is None)
-        object.__setattr__(self, "_scripts", own)
 
     def only(self, index) -> "Sky":
         """The same sky with the satellites of ``index`` alone."""
         rows = tuple(self.satellites[i] for i in index)
-        return Sky(self.spec, self.motion, self.clock, self.week, self.tow_s, self.iono_utc, rows)
+        return Sky(
+            self.spec, self.motion, self.clock, self.week, self.tow_s, self.iono_utc, rows, self.scripts
+        )
 
     def propagate(self, t_s) -> Propagation:
         """Delays at readings ``t_s`` (m,) of the receiver's clock, seconds since the start epoch.
@@ -275,7 +299,8 @@ class Sky:
         state = self.motion(t)
         propagate_kernel(
             o["k"], o["toe"], o["toc"], o["offset"], t,
-            np.ascontiguousarray(state.pos_ecef_m), np.ascontiguousarray(state.vel_ecef_mps), float(self.tow_s),
+            np.ascontiguousarray(state.pos_ecef_m), np.ascontiguousarray(state.vel_ecef_mps),
+            float(self.tow_s),
             self.spec.ionosphere == "klobuchar",
             np.array(iono["alpha"], dtype=float), np.array(iono["beta"], dtype=float),
             self.spec.troposphere == "saastamoinen", RELATIVE_HUMIDITY, out,
@@ -283,11 +308,12 @@ class Sky:
         return out
 
     def _from_scripts(self, t: np.ndarray) -> np.ndarray:
-        out = np.zeros((8, len(self._scripts), t.size))
-        for row, s in enumerate(self._scripts):
-            out[0, row] = s.delay_s - t * (s.doppler_hz + 0.5 * t * s.doppler_rate_hz_s) / F_L1_HZ
-            out[1, row] = -(s.doppler_hz + t * s.doppler_rate_hz_s) / F_L1_HZ
-            out[4, row], out[5, row] = np.radians(s.elevation_deg), np.radians(s.azimuth_deg)
+        rows = [i for i, s in enumerate(self.satellites) if s.ephemeris is None]
+        out = np.zeros((8, len(rows), t.size))
+        for row, i in enumerate(rows):
+            spec, run = self.scripts[self.satellites[i].name]
+            out[0, row], out[1, row], _ = run(t)
+            out[4, row], out[5, row] = np.radians(spec.elevation_deg), np.radians(spec.azimuth_deg)
             out[6, row] = C_MPS * out[0, row]
         return out
 
