@@ -1,11 +1,13 @@
 """Reduction of an ephemeris to the elements of an almanac at a common reference time (GPS and Galileo)."""
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from signals.constants import EARTH_RATE_RAD_S, MU_GALILEO_M3_S2, MU_GPS_M3_S2, SECONDS_PER_WEEK
 
 
-def reference_time(almanac: np.ndarray, step_s: int) -> tuple[int, int]:
+def reference_time(almanac: Iterable[np.void], step_s: int) -> tuple[int, int]:
     """(week, s of week) of the latest time of ephemeris, rounded down to a multiple of `step_s`."""
     latest = max(almanac, key=lambda record: (int(record["week"]), float(record["toe_s"])))
     return int(latest["week"]), int(latest["toe_s"]) // step_s * step_s

@@ -10,7 +10,7 @@ from signals import fec
 from signals.almanac import elements, epoch_on_grid, reference_time
 from signals.constants import GNSS_PI, SECONDS_PER_WEEK
 from signals.fields import Field, bits_of, integer, message_of, pack, unpack
-from signals.lnav import nearest_week
+from signals.lnav import BROADCAST, nearest_week
 from signals.records import EPHEMERIS, IONO_UTC
 
 SYMBOL_MS = 4
@@ -340,9 +340,7 @@ def encode(
                 cache[key] = _almanac_word(number, groups, group, iono_utc)
             else:
                 record = records[in_force]
-                values = {name: record[name] for name in EPHEMERIS.names if name != "system"} | {
-                    "type": number
-                }
+                values = {name: record[name] for name in BROADCAST} | {"type": number}
                 cache[key] = pack(WORDS[number], values, WORD_BITS, where)
         return cache[key]
 
@@ -378,14 +376,14 @@ def encode(
 
 def quantised(ephemeris: np.void) -> np.void:
     """Ephemeris as a receiver reads it from the message: every field rounded to its last bit."""
-    record = np.array(ephemeris, EPHEMERIS)[()]
+    record = np.array([ephemeris], EPHEMERIS)[0]
     where = f"I/NAV of E{record['prn']:02d}"
-    values = {name: record[name] for name in EPHEMERIS.names if name != "system"}
+    values = {name: record[name] for name in BROADCAST}
     words = [pack(WORDS[k], values | {"type": k}, WORD_BITS, where) for k in (1, 2, 3, 4)]
     words.append(_word_5(record, None, int(record["week"]), 0, where))
     for k, word in enumerate(words, 1):
         for name, value in unpack(WORDS[k], word, WORD_BITS).items():
-            if name in EPHEMERIS.names:
+            if name in BROADCAST:
                 record[name] = value
     record["iodc"] = record["iode"]
     return record
@@ -446,7 +444,7 @@ class Decoder:
     def __init__(self, prn: int):
         self.prn = prn
         self.ephemeris: np.void | None = None
-        self.iono_utc = np.zeros((), IONO_UTC)[()]
+        self.iono_utc = np.zeros(1, IONO_UTC)[0]
         self.iono_utc_valid: set[str] = set()
         self.ggto: tuple[float, float, float, int] | None = None
         self.almanac: dict[int, dict[str, float]] = {}
@@ -606,14 +604,14 @@ class Decoder:
         time = phase + index
         week += time // self.symbols_per_week - (phase + anchor) // self.symbols_per_week
         tow_s = time % self.symbols_per_week * self.symbol_ms * 1e-3
-        record = np.zeros((), EPHEMERIS)[()]
+        record = np.zeros(1, EPHEMERIS)[0]
         for values in (*self._set.values(), self._word_5):
             for name, value in values.items():
-                if name in EPHEMERIS.names:
+                if name in BROADCAST:
                     record[name] = value
         record["system"], record["prn"], record["iodc"] = b"E", self.prn, record["iode"]
         record["health"], record["tow_s"] = self.health, tow_s
-        record["week"] = week + round((tow_s - record["toe_s"]) / SECONDS_PER_WEEK)
+        record["week"] = week + round((tow_s - float(record["toe_s"])) / SECONDS_PER_WEEK)
         if self.ephemeris is not None and self.ephemeris["iode"] == record["iode"]:
             record["tow_s"] = self.ephemeris["tow_s"]  # of the first time the set was complete
         self.ephemeris = record

@@ -12,6 +12,7 @@ from signals.constants import GNSS_PI, SECONDS_PER_WEEK
 from signals.fields import Field, bits_of, integer, pack, unpack
 from signals.records import EPHEMERIS, IONO_UTC
 
+BROADCAST = tuple(name for name in EPHEMERIS.names or () if name != "system")
 BIT_MS = 20
 SUBFRAME_BITS = 300
 SUBFRAMES_PER_WEEK = 100_800
@@ -221,7 +222,7 @@ def _find(bits, start):
 
 
 def _values(record: np.void) -> dict[str, float]:
-    return {name: float(record[name]) for name in EPHEMERIS.names if name != "system"}
+    return {name: float(record[name]) for name in BROADCAST}
 
 
 def _header(count: int, where: str) -> int:
@@ -358,19 +359,20 @@ def encode(
     records = _sorted_records(ephemeris)
     by_prn = _by_prn(almanac)
     where = f"LNAV of G{records['prn'][0]:02d}"
-    cache: dict[tuple[int, ...], int] = {}
+    cache: dict[tuple[int, int, int], int] = {}
 
     def body(count: int) -> int:
         subframe, frame = count % 5 + 1, count // 5
         if subframe <= 3:
-            in_force = _in_force(records, frame * 30)
-            key = (subframe, in_force, count // SUBFRAMES_PER_WEEK)
+            in_force, week_now = _in_force(records, frame * 30), count // SUBFRAMES_PER_WEEK
+            key = (subframe, in_force, week_now)
             if key not in cache:
-                cache[key] = _ephemeris_subframe(records[in_force], subframe, key[2], where)
+                cache[key] = _ephemeris_subframe(records[in_force], subframe, week_now, where)
         else:
-            key = (subframe, frame % (SUBFRAMES_PER_WEEK // 5) % 25 + 1)
+            page = frame % (SUBFRAMES_PER_WEEK // 5) % 25 + 1
+            key = (subframe, page, 0)
             if key not in cache:
-                cache[key] = _long_term_page(*key, iono_utc, by_prn)
+                cache[key] = _long_term_page(subframe, page, iono_utc, by_prn)
         return cache[key]
 
     first = (week * SECONDS_PER_WEEK + int(tow_s)) // 6
@@ -382,11 +384,11 @@ def encode(
 
 def quantised(ephemeris: np.void) -> np.void:
     """Ephemeris as a receiver reads it from the message: every field rounded to its last bit."""
-    record = np.array(ephemeris, EPHEMERIS)[()]
+    record = np.array([ephemeris], EPHEMERIS)[0]
     for number, table in enumerate((SUBFRAME_1, SUBFRAME_2, SUBFRAME_3), 1):
         message = _ephemeris_subframe(record, number, int(record["week"]), f"LNAV of G{record['prn']:02d}")
         for name, value in unpack(table, message, SUBFRAME_BITS).items():
-            if name in EPHEMERIS.names:
+            if name in BROADCAST:
                 record[name] = value
     return record
 
@@ -394,7 +396,7 @@ def quantised(ephemeris: np.void) -> np.void:
 # --- decoder ---
 
 
-def nearest_week(truncated: int, modulus: int, week: int) -> int:
+def nearest_week(truncated: float, modulus: int, week: int) -> int:
     """Week nearest to `week` whose value modulo `modulus` is `truncated`."""
     return week + (int(truncated) - week + modulus // 2) % modulus - modulus // 2
 
@@ -432,7 +434,7 @@ class Decoder:
         self.prn = prn
         self.first_week = first_week
         self.ephemeris: np.void | None = None
-        self.iono_utc = np.zeros((), IONO_UTC)[()]
+        self.iono_utc = np.zeros(1, IONO_UTC)[0]
         self.iono_utc_valid: set[str] = set()
         self.ggto = None
         self.almanac: dict[int, dict[str, float]] = {}
@@ -569,7 +571,7 @@ class Decoder:
         if number <= 3:
             values = unpack((SUBFRAME_1, SUBFRAME_2, SUBFRAME_3)[number - 1], message, SUBFRAME_BITS)
             self._subframes[number] = values | {"index": index}
-            if number == 1:
+            if number == 1 and self._phase_candidate is not None:
                 self.health = int(values["health"])
                 week = self.first_week + (int(values["week_1024"]) - self.first_week) % 1024
                 self._week_anchor = (week, index, self._phase_candidate)
@@ -594,12 +596,12 @@ class Decoder:
             return
         week, anchor, phase = self._week_anchor
         tow_s = (phase + anchor) % self.symbols_per_week * self.symbol_ms * 1e-3
-        record = np.zeros((), EPHEMERIS)[()]
+        record = np.zeros(1, EPHEMERIS)[0]
         for name, value in (one | two | three).items():
-            if name in EPHEMERIS.names:
+            if name in BROADCAST:
                 record[name] = value
         record["system"], record["prn"], record["tow_s"] = b"G", self.prn, tow_s
-        record["week"] = week + round((tow_s - record["toe_s"]) / SECONDS_PER_WEEK)
+        record["week"] = week + round((tow_s - float(record["toe_s"])) / SECONDS_PER_WEEK)
         if self.ephemeris is not None and self.ephemeris["iodc"] == record["iodc"]:
             record["tow_s"] = self.ephemeris["tow_s"]  # of the first time the set was complete
         self.ephemeris = record

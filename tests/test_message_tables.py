@@ -1,5 +1,6 @@
 """The field tables against the design note that states them, read by program."""
 
+import gzip
 import re
 from pathlib import Path
 
@@ -84,3 +85,53 @@ def test_inav_table(number_: int) -> None:
         assert flags <= want
         want = want - flags | {(((43, 5),), "u", 1.0, False)}
     assert want == have
+
+
+RINEX = NOTE.parents[1] / "data" / "rinex" / "VILL00ESP_R_20181700000_01D_MN.rnx.gz"
+ORBIT_LINES = (
+    ("iode", "crs_m", "delta_n_rad_s", "m0_rad"),
+    ("cuc_rad", "e", "cus_rad", "sqrt_a_sqrt_m"),
+    ("toe_s", "cic_rad", "omega0_rad", "cis_rad"),
+    ("i0_rad", "crc_m", "omega_rad", "omega_dot_rad_s"),
+    ("idot_rad_s",),
+)
+"""Order of the numbers of a RINEX 3 record, common to GPS and Galileo (RINEX 3.03, tables A6 and A8)."""
+
+
+def broadcast_records() -> list[tuple[str, dict[str, float]]]:
+    """(system, fields) of the GPS and Galileo records of a day recorded at a station."""
+    lines = gzip.open(RINEX, "rt").read().splitlines()
+    at = next(k for k, line in enumerate(lines) if "END OF HEADER" in line) + 1
+    records = []
+    while at < len(lines):
+        system = lines[at][0]
+        n = 4 if system in "RS" else 8
+        if system in "GE":
+            rows = [[row[4 + 19 * k : 23 + 19 * k] for k in range(4)] for row in lines[at : at + n]]
+            values = dict(zip(("af0_s", "af1_s_s", "af2_s_s2"), rows[0][1:], strict=True))
+            for names, row in zip(ORBIT_LINES, rows[1:], strict=False):
+                values |= dict(zip(names, row, strict=False))
+            values["tgd_s"] = rows[6][2 if system == "G" else 3]
+            records.append((system, {name: float(text.replace("D", "e")) for name, text in values.items()}))
+        at += n
+    return records
+
+
+@pytest.mark.skipif(not RINEX.is_file(), reason="the RINEX file is not beside this checkout")
+def test_real_broadcasts_lie_on_our_grid() -> None:
+    """Every number of a real day is a whole multiple of our last bit, and inside our limits.
+
+    RINEX prints 13 digits, so a 32-bit field comes back within 2^32 1e-12 / 2 = 0.002 of its last bit.
+    """
+    tables = {
+        "G": (*lnav.SUBFRAME_1, *lnav.SUBFRAME_2, *lnav.SUBFRAME_3),
+        "E": (*inav.WORD_1, *inav.WORD_2, *inav.WORD_3, *inav.WORD_4, *inav.WORD_5),
+    }
+    records = broadcast_records()
+    assert len(records) > 500
+    for system, values in records:
+        for field in tables[system]:
+            if field.name in values:
+                raw = values[field.name] / field.lsb
+                assert abs(raw - round(raw)) < 0.0025, (system, field.name)
+                assert field.limits[0] <= round(raw) <= field.limits[1], (system, field.name)
