@@ -12,7 +12,8 @@ F_L1_HZ = 1575.42e6
 class Satellite:
     """Signal of one satellite: complex samples at any sample index, carrier and code coherent.
 
-    Doppler f(t) = doppler_hz + ramp_hz_s t; carrier phase = phase0 + integral of f; code phase advances with it / 1540.
+    Doppler f(t) = doppler_hz + ramp_hz_s t; carrier phase = phase0 + integral of f; code phase advances with
+    it / 1540.
     """
 
     def __init__(

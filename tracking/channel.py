@@ -34,6 +34,11 @@ _BOC61_FITS_HZ = 15e6  # below it the BOC(6,1) part of CBOC is not in the sample
 _MAX_TABLE_RATE_HZ = 300e6  # rows per sample x fs: bounds a table's size at high rates
 
 
+def _text(signal):
+    """A fixed-width bytes field (array scalar or 0-d array) as text."""
+    return np.asarray(signal).item().decode()
+
+
 class TapsSpec(BaseModel):
     """A multicorrelator window: offsets k * spacing_chips, k = -(count - 1) / 2 .. (count - 1) / 2."""
 
@@ -85,7 +90,9 @@ class L1caTracking(_Loops):
 
 
 class E1Tracking(_Loops):
-    """Galileo E1 channels: the pilot E1-C (pure PLL after secondary-code synchronisation) or the data E1-B alone."""
+    """Galileo E1 channels: the pilot E1-C (pure PLL after secondary-code synchronisation) or the data E1-B
+    alone.
+    """
 
     component: Literal["pilot", "data"] = "pilot"
     integration_ms: int = Field(20, ge=4, le=100)
@@ -173,11 +180,11 @@ class Tracker:
     def add(self, acquisition):
         """Start a channel from one ACQUISITION row -> channel index.
 
-        The channel begins at the next sample that will be processed (or, before the first slab, at the row's own
-        sample); the code phase is carried there with the row's Doppler. A channel that was lost or released leaves
-        its index to the next one.
+        The channel begins at the next sample that will be processed (or, before the first slab, at the row's
+        own sample); the code phase is carried there with the row's Doppler. A channel that was lost or
+        released leaves its index to the next one.
         """
-        signal = bytes(acquisition["signal"]).decode()
+        signal = _text(acquisition["signal"])
         if signal not in SIGNALS:
             raise ValueError(f"signal {signal!r} is unknown: use one of {', '.join(SIGNALS)}")
         prn = int(acquisition["prn"])
@@ -205,7 +212,9 @@ class Tracker:
         return np.flatnonzero(self.channels["state"] == STATE_LOST)
 
     def taps_chips(self, c):
-        """True offsets of all taps of channel ``c``, chips, in the order of ``corr[c, k]`` (first the window)."""
+        """True offsets of all taps of channel ``c``, chips, in the order of ``corr[c, k]`` (first the
+        window).
+        """
         return self._taps[c]
 
     def window(self, c):
@@ -233,7 +242,7 @@ class Tracker:
             self._acc = np.pad(self._acc, ((0, 0), (0, 2 * more)))
         per_chip = float(st["samples_per_chip"]) * int(st["n_phase"])
         q = np.round(np.asarray(offsets) * per_chip).astype(np.int64)
-        noise = self._noise_offset(bytes(st["signal"]).decode(), int(st["prn"]))
+        noise = self._noise_offset(_text(st["signal"]), int(st["prn"]))
         self._tap_q[c] = 0
         self._tap_q[c, :n_taps] = q
         self._tap_q[c, n_taps] = round(noise * per_chip)
@@ -338,7 +347,7 @@ class Tracker:
         st["code_code"] = CODE_DISCRIMINATORS[loops.code_discriminator]
         incoming = waveform
         if not is_ca and self.fs_hz >= _BOC61_FITS_HZ:
-            incoming = SIGNALS[bytes(st["signal"]).decode()].waveform
+            incoming = SIGNALS[_text(st["signal"])].waveform
         acf = lambda d: chip_acf(d, incoming, waveform)  # noqa: E731
         spacing = float(offsets[int(st["early"])] - offsets[int(st["late"])])
         very = 1.0 if is_ca else float(offsets[int(st["very_early"])] - offsets[int(st["very_late"])])
@@ -456,8 +465,9 @@ class Tracker:
     def snapshot(self, sample_index):
         """Replicas of all channels at one receiver sample -> REPLICA (C,).
 
-        The NCO of each channel is run from its next code period to ``sample_index`` at its present rates, so that
-        pseudoranges formed from these rows belong to one receiver time. Nothing but the filtered replica enters.
+        The NCO of each channel is run from its next code period to ``sample_index`` at its present rates, so
+        that pseudoranges formed from these rows belong to one receiver time. Nothing but the filtered replica
+        enters.
         """
         ch = self.channels
         out = np.zeros(len(ch), REPLICA)

@@ -1,11 +1,14 @@
-"""Carrier, frequency and code discriminators: pure functions of correlator outputs, each with its integer code.
+"""Carrier, frequency and code discriminators: pure functions of correlator outputs, each with its integer
+code.
 
-``kernels.py`` compiles these functions into its own cache entry; numba does not notice a change in *this* file, so
-clear ``tracking/__pycache__`` after editing it. To add one: write the function, give it a code, add a branch to the
-selecting function below it, and name it in ``CARRIER_DISCRIMINATORS`` or ``CODE_DISCRIMINATORS``.
+``kernels.py`` compiles these functions into its own cache entry; numba does not notice a change in *this*
+file, so clear ``tracking/__pycache__`` after editing it. To add one: write the function, give it a code, add
+a branch to the selecting function below it, and name it in ``CARRIER_DISCRIMINATORS`` or
+``CODE_DISCRIMINATORS``.
 
-Signs (``tracking.records``): phase, frequency and code errors are positive where the incoming signal is ahead of
-the replica. E is the replica advanced by half the early-late spacing, so an incoming code that is ahead favours E.
+Signs (``tracking.records``): phase, frequency and code errors are positive where the incoming signal is ahead
+of the replica. E is the replica advanced by half the early-late spacing, so an incoming code that is ahead
+favours E.
 """
 
 import math
@@ -84,7 +87,8 @@ def frequency_error_hz(i1, q1, i2, q2, separation_s):
     """atan2(cross, dot) / (2 pi dt) between the two halves of one integration, in Hz.
 
     cross = I1 Q2 - I2 Q1, dot = I1 I2 + Q1 Q2 (Kaplan & Hegarty, table 5.4). Both halves lie within one data
-    symbol, so no sign can turn between them; unambiguous for |df| < 1 / (2 dt), dt = ``separation_s`` = T / 2.
+    symbol, so no sign can turn between them; unambiguous for |df| < 1 / (2 dt), dt = ``separation_s`` = T /
+    2.
     """
     cross, dot = i1 * q2 - i2 * q1, i1 * i2 + q1 * q2
     if cross == 0.0 and dot == 0.0:
@@ -151,7 +155,8 @@ def code_scale_chips(name, acf, spacing_chips, very_spacing_chips=1.0):
     Parameters
     ----------
     acf : callable
-        Correlation of the incoming waveform with the replica, R(d), d in chips (``signals.modulation.chip_acf``).
+        Correlation of the incoming waveform with the replica, R(d), d in chips
+        (``signals.modulation.chip_acf``).
     spacing_chips, very_spacing_chips : float
         Early-late and very-early-very-late spacing d (E at +d/2, L at -d/2).
 

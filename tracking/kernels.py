@@ -1,14 +1,16 @@
-"""The tracking kernel: correlate, discriminate, filter and steer, channel by channel, one code period at a time.
+"""The tracking kernel: correlate, discriminate, filter and steer, channel by channel, one code period at a
+time.
 
-One call of ``track_slab`` takes every listed channel through all whole code periods of the samples given. The unit of
-work is the code period of the channel's own replica, so results do not depend on where slabs are cut.
+One call of ``track_slab`` takes every listed channel through all whole code periods of the samples given. The
+unit of work is the code period of the channel's own replica, so results do not depend on where slabs are cut.
 
-Correlator. Blocks of at most 1024 samples; per block one row and column of the code table per tap (all taps share the
-rounding of the replica's phase, whose mean is removed from the code error), one carrier table per frequency, the phase
-of a block applied to its sums. Up to 7 taps are wiped and correlated in one pass; more go through a wiped buffer in L1.
+Correlator. Blocks of at most 1024 samples; per block one row and column of the code table per tap (all taps
+share the rounding of the replica's phase, whose mean is removed from the code error), one carrier table per
+frequency, the phase of a block applied to its sums. Up to 7 taps are wiped and correlated in one pass; more
+go through a wiped buffer in L1.
 
-The functions of ``discriminators`` and ``lock`` are compiled into this file's cache entry: clear ``__pycache__`` after
-editing them.
+The functions of ``discriminators`` and ``lock`` are compiled into this file's cache entry: clear
+``__pycache__`` after editing them.
 """
 
 import math
@@ -308,8 +310,8 @@ def _carrier_table(step_cycles, ct, sn):
 def _correlate_period(st, xi, xq, a0, n, theta, step, rate, ct, sn, pool, tap_q, starts, wi, wq, out, sums):
     """One code period: ``sums`` (n_sums + 1 complex as pairs; the last is the prompt's second half).
 
-    theta, step: carrier phase at the first sample and its advance per sample, cycles. Returns the sum over samples of
-    (replica's phase - nominal phase), chips, at the mean of E and L.
+    theta, step: carrier phase at the first sample and its advance per sample, cycles. Returns the sum over
+    samples of (replica's phase - nominal phase), chips, at the mean of E and L.
     """
     n_sums, shift, mask = st.n_sums, st.phase_shift, st.n_phase - 1
     blocks = 2 * ((n + 2 * _BLOCK - 1) // (2 * _BLOCK))
@@ -367,8 +369,8 @@ def _peak_offset(left, mid, right):
 def _search_ca(hist, energy):
     """Joint search over frequency (+-250 Hz) and bit edge: energies of 9 sums of 20 ms, summed.
 
-    hist: (200, 2) prompts of 1 ms with a fixed NCO. ``energy`` (20,): per bit edge at the best frequency. Returns
-    (frequency error, best energy).
+    hist: (200, 2) prompts of 1 ms with a fixed NCO. ``energy`` (20,): per bit edge at the best frequency.
+    Returns (frequency error, best energy).
     """
     step, half = 10.0, 25
     prefix = np.empty((HISTORY + 1, 2))
@@ -404,8 +406,8 @@ def _search_ca(hist, energy):
 def _search_pilot(hist, secondary):
     """Joint search over frequency (+-200 Hz) and secondary-code phase: energies of 2 sums of 25 periods.
 
-    hist: (100, 2) prompts of 2 ms (halves of a period). Returns (frequency error, chip at the first period, best
-    energy, best energy of any other chip).
+    hist: (100, 2) prompts of 2 ms (halves of a period). Returns (frequency error, chip at the first period,
+    best energy, best energy of any other chip).
     """
     step, half = 2.5, 80
     z = np.empty((50, 2))
@@ -498,8 +500,9 @@ def _set_frequency(st, error_hz):
 def _synchronise(st, hist, secondary, noise):
     """Use a full history: find the frequency and the symbol (or secondary-code) edge, or try again.
 
-    noise: power of a prompt of one code period. Thresholds: the sums of noise alone exceed them with less than 1e-5
-    (chi-square of 18 degrees of freedom, about 150 independent cells; of 4, about 4000; the mean of 50 products).
+    noise: power of a prompt of one code period. Thresholds: the sums of noise alone exceed them with less
+    than 1e-5 (chi-square of 18 degrees of freedom, about 150 independent cells; of 4, about 4000; the mean of
+    50 products).
     """
     st.hist_n = 0
     if _bump_decision(st, 1.5):
@@ -554,8 +557,8 @@ def _synchronise(st, hist, secondary, noise):
 def _bump_decision(st, ratio):
     """Jump to the very-early or very-late tap where it holds ``ratio`` times the prompt's power.
 
-    The side peaks of BOC(1,1) are half a chip from the main one with a quarter of its power and the opposite sign
-    (bump jumping: Fine & Wilson, ION NTM 1999).
+    The side peaks of BOC(1,1) are half a chip from the main one with a quarter of its power and the opposite
+    sign (bump jumping: Fine & Wilson, ION NTM 1999).
     """
     if st.very_early < 0 or st.steered != 0:
         return False

@@ -1,13 +1,15 @@
-"""Digital loop filters: gains whose discrete noise bandwidth is exactly what was asked for, and thermal jitter.
+"""Digital loop filters: gains whose discrete noise bandwidth is exactly what was asked for, and thermal
+jitter.
 
-Carrier loop (rate-only NCO, mid-interval phase; Stephens & Thomas, IEEE Trans. AES 31(1), 1995). With the error
-e_k (cycles) of integration k, T its length,
+Carrier loop (rate-only NCO, mid-interval phase; Stephens & Thomas, IEEE Trans. AES 31(1), 1995). With the
+error e_k (cycles) of integration k, T its length,
 
     a += K3 e_k / T^2,   v += K2 e_k / T + a T,   f_{k+1} = v + K1 e_k / T
 
-and the phase at mid-interval advances by (f_k + f_{k+1}) T / 2. Third order: a triple real pole at p; the fourth pole
-r follows from the characteristic polynomial at w = z^-1 = -1: (1 + p)^3 (1 + r) = 8. Second order: K2 = K1^2 / 2
-(damping 1/sqrt(2) in the continuous limit), because a double pole cannot reach B T = 0.3.
+and the phase at mid-interval advances by (f_k + f_{k+1}) T / 2. Third order: a triple real pole at p; the
+fourth pole r follows from the characteristic polynomial at w = z^-1 = -1: (1 + p)^3 (1 + r) = 8. Second
+order: K2 = K1^2 / 2 (damping 1/sqrt(2) in the continuous limit), because a double pole cannot reach B T =
+0.3.
 """
 
 import math
@@ -26,7 +28,8 @@ __all__ = [
 ]
 
 MAX_BT = 0.3
-"""Largest noise bandwidth times integration time that is accepted; poles go beyond control above about 0.4."""
+"""Largest noise bandwidth times integration time that is accepted; poles go beyond control above about 0.4.
+"""
 
 
 def _triple_pole(p):
@@ -66,7 +69,8 @@ def pll_noise_bandwidth_t(gains):
 
 @lru_cache(maxsize=256)
 def pll_gains(order, bw_hz, T_s):
-    """(K1, K2, K3) of the carrier loop of ``order`` 2 or 3 with noise bandwidth ``bw_hz`` at interval ``T_s``.
+    """(K1, K2, K3) of the carrier loop of ``order`` 2 or 3 with noise bandwidth ``bw_hz`` at interval
+    ``T_s``.
 
     Raises
     ------

@@ -1,0 +1,153 @@
+"""Data symbols of the channels to messages, and messages to transmit times."""
+
+import numpy as np
+
+from signals import inav, lnav
+from signals.records import EPHEMERIS
+from tracking.kernels import KIND_CA, KIND_PILOT
+from tracking.lock import STATE_LOCKED
+
+__all__ = ["Telemetry"]
+
+_GAP = 1000  # symbols: a restarted channel must not continue the count of the one before
+
+
+class Telemetry:
+    """Feeds the symbols of a ``Tracker`` to one decoder per satellite; decoders outlive channels.
+
+    Symbols of C/A are bits of 20 ms that begin at the synchronised code period; those of E1-B one per code.
+    With the pilot in lock (CS25_1 upright) the composite eB(..) - eC(..) leaves E1-B inverted: the sign is
+    restored, so that a symbol + is logic 0 (Galileo OS SIS ICD, 2.3.3). Other half-cycle ambiguities are the
+    decoder's.
+
+    Attributes
+    ----------
+    decoders : dict
+        (system, prn) -> ``signals.lnav.Decoder`` or ``signals.inav.Decoder``, ("G", 7) for instance.
+    """
+
+    def __init__(self, tracker):
+        self.tracker = tracker
+        self.decoders = {}
+        self._base = {}  # channel -> symbol index of its code period 0
+        self._end = {}  # satellite -> next symbol index
+        self._slips = {}  # satellite -> slips at the last call of slipped
+
+    def start(self, c):
+        """Channel ``c`` was given to a satellite (again): its code periods count from zero."""
+        key = self._satellite(c)
+        if key not in self.decoders:
+            self.decoders[key] = lnav.Decoder(key[1]) if key[0] == "G" else inav.Decoder(key[1])
+        self._base[c] = self._end.get(key, 0) + _GAP
+        self._slips.pop(key, None)
+
+    def update(self):
+        """Decode what the last ``Tracker.process`` brought -> list of (channel, event) of the decoders."""
+        events = []
+        for c in np.flatnonzero(self.tracker.symbol_counts):
+            c = int(c)
+            if c not in self._base:
+                self.start(c)
+            rows = self.tracker.symbols[c, : self.tracker.symbol_counts[c]]
+            index = self._index(c, rows["code_period"])
+            sign = -1.0 if self.tracker.channels["kind"][c] == KIND_PILOT else 1.0
+            decoder, key = self.decoders[self._satellite(c)], self._satellite(c)
+            # A bit that was cut off leaves a hole in the count: feed the runs between holes.
+            for run in np.split(np.arange(len(index)), np.flatnonzero(np.diff(index) != 1) + 1):
+                events += [(c, e) for e in decoder.feed(sign * rows["soft"][run], int(index[run[0]]))]
+            self._end[key] = int(index[-1]) + 1
+        return events
+
+    def reference(self, c):
+        """(code period, transmit time of week at its start in ms) of channel ``c``; (0, -1) while not
+        decoded.
+        """
+        st = self.tracker.channels[c]
+        key = self._satellite(c)
+        if c not in self._base or key not in self._end or st["state"] != STATE_LOCKED:
+            return 0, -1
+        tow_ms = self.decoders[key].tow_of(self._end[key])
+        if tow_ms is None:
+            return 0, -1
+        return self._period(c, self._end[key]), int(tow_ms)
+
+    def transmit_time_ms(self, c, code_period):
+        """Transmit time of week (ms) of the start of ``code_period`` of channel ``c``; None while not
+        decoded.
+        """
+        period, tow_ms = self.reference(c)
+        if tow_ms < 0:
+            return None
+        step = 1 if self.tracker.channels["kind"][c] == KIND_CA else 4
+        return (tow_ms + (int(code_period) - period) * step) % 604_800_000
+
+    def stamp(self, epochs, counts):
+        """Write ``tow_s`` into EPOCH rows of ``Tracker.process`` (C, n_max) where it is known."""
+        for c in np.flatnonzero(counts):
+            period, tow_ms = self.reference(int(c))
+            if tow_ms >= 0:
+                step = 1e-3 if self.tracker.channels["kind"][c] == KIND_CA else 4e-3
+                rows = epochs[c, : counts[c]]
+                tow_s = tow_ms * 1e-3 + (rows["symbol_index"] - period) * step
+                # The integration starts up to one sample after the code does: code_phase_chips tells how
+                # much.
+                rows["tow_s"] = (tow_s + rows["code_phase_chips"] / 1.023e6) % 604_800.0
+
+    def slipped(self, channels, slips):
+        """Whether each channel slipped a cycle since the last call; a channel not asked before did."""
+        out = np.zeros(len(channels), bool)
+        for k, c in enumerate(channels):
+            key = self._satellite(int(c))
+            out[k] = self._slips.get(key) != int(slips[k])
+            self._slips[key] = int(slips[k])
+        return out
+
+    def ephemerides(self):
+        """Newest decoded ephemeris of each satellite -> EPHEMERIS (n,)."""
+        rows = [d.ephemeris for d in self.decoders.values() if d.ephemeris is not None]
+        return np.array(rows, EPHEMERIS) if rows else np.zeros(0, EPHEMERIS)
+
+    def iono_utc(self, system):
+        """IONO_UTC record of the most complete decoder of ``system`` ("G" or "E"); None before anything came."""
+        best = None
+        for (s, _), d in self.decoders.items():
+            if (
+                s == system
+                and d.iono_utc_valid
+                and (best is None or len(d.iono_utc_valid) > len(best.iono_utc_valid))
+            ):
+                best = d
+        return None if best is None else best.iono_utc
+
+    def has_ephemeris(self, signal, prn):
+        """Whether a complete ephemeris of the satellite was decoded."""
+        d = self.decoders.get((_system(signal), int(prn)))
+        return d is not None and d.ephemeris is not None
+
+    def healthy(self, signal, prn):
+        """The satellite's health; None while not decoded."""
+        d = self.decoders.get((_system(signal), int(prn)))
+        return None if d is None else d.healthy
+
+    def _satellite(self, c):
+        st = self.tracker.channels[c]
+        return _system(st["signal"]), int(st["prn"])
+
+    def _index(self, c, code_period):
+        """Running symbol index of the symbol that starts at ``code_period``."""
+        st = self.tracker.channels[c]
+        if st["kind"] == KIND_CA:
+            return self._base[c] + (np.asarray(code_period) - st["symbol_phase"]) // 20
+        return self._base[c] + np.asarray(code_period)
+
+    def _period(self, c, index):
+        """Code period at which symbol ``index`` starts."""
+        st = self.tracker.channels[c]
+        if st["kind"] == KIND_CA:
+            return int((index - self._base[c]) * 20 + st["symbol_phase"])
+        return int(index - self._base[c])
+
+
+def _system(signal):
+    text = signal.decode() if isinstance(signal, bytes) else str(np.asarray(signal).astype("U4"))
+    return "G" if text == "L1CA" else "E"
