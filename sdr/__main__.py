@@ -22,11 +22,15 @@ app = App(
     help_format="plaintext",
 )
 
-Json = Annotated[bool, Parameter(name="--json", negative="", help="Print one JSON object on stdout and nothing else.")]
+Json = Annotated[
+    bool, Parameter(name="--json", negative="", help="Print one JSON object on stdout and nothing else.")
+]
 Out = Annotated[Path | None, Parameter(name=["--output", "-o"], help="Results file (HDF5).")]
 Set = Annotated[
     list[str],
-    Parameter(name="--set", negative="", help="Override a scenario key, e.g. --set receiver.tracking.dll_bw_hz=1"),
+    Parameter(
+        name="--set", negative="", help="Override a scenario key, e.g. --set receiver.tracking.dll_bw_hz=1"
+    ),
 ]
 Threads = Annotated[int, Parameter(help="Worker threads; the results do not depend on it.")]
 
@@ -36,10 +40,15 @@ Threads = Annotated[int, Parameter(help="Worker threads; the results do not depe
 class Recording:
     """How a file of IF samples is to be read; what SigMF or .tag metadata say needs no option."""
 
-    format: Annotated[str | None, Parameter(help="ci8 ci16 cf32 ri8 ri16 rf32 ci1 ci2 ri1 ri2, or a receiver's own name for it.")] = None
+    format: Annotated[
+        str | None,
+        Parameter(help="ci8 ci16 cf32 ri8 ri16 rf32 ci1 ci2 ri1 ri2, or a receiver's own name for it."),
+    ] = None
     fs_hz: Annotated[float | None, Parameter(help="Sample rate in Hz.")] = None
     if_hz: Annotated[float | None, Parameter(help="Intermediate frequency in Hz.")] = None
-    conjugate: Annotated[bool, Parameter(negative="", help="The spectrum is inverted: conjugate the samples.")] = False
+    conjugate: Annotated[
+        bool, Parameter(negative="", help="The spectrum is inverted: conjugate the samples.")
+    ] = False
     skip_s: Annotated[float, Parameter(help="Leave out the first seconds.")] = 0.0
     duration_s: Annotated[float | None, Parameter(help="Use this many seconds.")] = None
 
@@ -61,7 +70,11 @@ def run(
     """
     from sdr import jobs
 
-    _report("run", jobs.run(scenario, output=output, overrides=set_, threads=threads, plots=plots, quiet=json), json)
+    _report(
+        "run",
+        jobs.run(scenario, output=output, overrides=set_, threads=threads, plots=plots, quiet=json),
+        json,
+    )
 
 
 @app.command
@@ -85,7 +98,7 @@ def receive(
     file: Path,
     /,
     *,
-    recording: Recording = Recording(),  # noqa: B008
+    recording: Recording = Recording(),
     scenario: Annotated[str | None, Parameter(help="Scenario whose [receiver] section is used.")] = None,
     output: Out = None,
     plots: Annotated[bool, Parameter(negative="", help="Draw the figures beside the results.")] = False,
@@ -107,10 +120,12 @@ def acquire(
     file: Path,
     /,
     *,
-    recording: Recording = Recording(),  # noqa: B008
+    recording: Recording = Recording(),
     signals: Annotated[list[str], Parameter(help="Signals to search: L1CA, E1C.")] = ["L1CA", "E1C"],  # noqa: B006
     doppler_hz: Annotated[float | None, Parameter(help="Search Doppler from minus to plus this.")] = None,
-    p_fa: Annotated[float | None, Parameter(help="False-alarm probability over one satellite's whole search.")] = None,
+    p_fa: Annotated[
+        float | None, Parameter(help="False-alarm probability over one satellite's whole search.")
+    ] = None,
     json: Json = False,
 ) -> None:
     """Search a recording for satellites."""
@@ -124,8 +139,10 @@ def probe(
     file: Path,
     /,
     *,
-    recording: Recording = Recording(),  # noqa: B008
-    plots: Annotated[Path | None, Parameter(help="Write the spectrum and level figures into this directory.")] = None,
+    recording: Recording = Recording(),
+    plots: Annotated[
+        Path | None, Parameter(help="Write the spectrum and level figures into this directory.")
+    ] = None,
     json: Json = False,
 ) -> None:
     """Show what a stranger's recording is, and which declaration of it is consistent."""
@@ -139,7 +156,9 @@ def plot(
     results: Path,
     /,
     *,
-    output: Annotated[Path | None, Parameter(name=["--output", "-o"], help="Directory for the figures.")] = None,
+    output: Annotated[
+        Path | None, Parameter(name=["--output", "-o"], help="Directory for the figures.")
+    ] = None,
     json: Json = False,
 ) -> None:
     """Draw the figures of a results file."""
@@ -152,10 +171,14 @@ def plot(
 def lines(
     *,
     signal: Annotated[str | None, Parameter(help="L1CA, E1B or E1C; all if not given.")] = None,
-    waveform: Annotated[str | None, Parameter(help="BPSK, BOC11, CBOC+ or CBOC-; all that fit if not given.")] = None,
+    waveform: Annotated[
+        str | None, Parameter(help="BPSK, BOC11, CBOC+ or CBOC-; all that fit if not given.")
+    ] = None,
     prn: Annotated[int | None, Parameter(help="One PRN; all if not given.")] = None,
     top: Annotated[int, Parameter(help="Lines to list per signal and waveform, or for one PRN.")] = 5,
-    tiered: Annotated[bool, Parameter(negative="", help="E1-C with its secondary code (100 ms period).")] = False,
+    tiered: Annotated[
+        bool, Parameter(negative="", help="E1-C with its secondary code (100 ms period).")
+    ] = False,
     plots: Annotated[Path | None, Parameter(help="Write the figures into this directory.")] = None,
     json: Json = False,
 ) -> None:
@@ -166,7 +189,9 @@ def lines(
 
 
 @app.command
-def bench(*, json: Json = False, quick: Annotated[bool, Parameter(negative="", help="Shorter, noisier.")] = False) -> None:
+def bench(
+    *, json: Json = False, quick: Annotated[bool, Parameter(negative="", help="Shorter, noisier.")] = False
+) -> None:
     """Measure the speed of this machine's receiver and generator, as ratios to a plain kernel in the same run."""
     from sdr import bench as bencher
 
@@ -179,7 +204,11 @@ def scenarios(*, json: Json = False) -> None:
     from sdr import scenario
 
     table = [{"name": n, "description": scenario.load(n)[0].description} for n in scenario.built_in()]
-    _report("scenarios", {"scenarios": table, "text": "\n".join(f"{r['name']:24} {r['description']}" for r in table)}, json)
+    _report(
+        "scenarios",
+        {"scenarios": table, "text": "\n".join(f"{r['name']:24} {r['description']}" for r in table)},
+        json,
+    )
 
 
 def _report(command: str, result: dict[str, Any], as_json: bool) -> None:

@@ -20,14 +20,18 @@ def hermite(x: np.ndarray, x_k: np.ndarray, y_k: np.ndarray, dy_k: np.ndarray) -
     )
 
 
-def tracking_errors(epochs: np.ndarray, truth: np.ndarray, fs_hz: float, signal: str) -> dict[str, np.ndarray]:
+def tracking_errors(
+    epochs: np.ndarray, truth: np.ndarray, fs_hz: float, signal: str
+) -> dict[str, np.ndarray]:
     """Replica minus truth for one channel.
 
     Parameters: ``epochs`` EPOCH rows and ``truth`` TRUTH rows of the same satellite. Returns arrays over the epochs
     inside the truth's span: ``t_s``, ``code_m``, ``phase_cycles`` (the constant of the carrier, a multiple of half a
     cycle, removed), ``doppler_hz`` and ``code_minus_carrier_m`` (its mean removed).
     """
-    inside = (epochs["sample_index"] >= truth["sample_index"][0]) & (epochs["sample_index"] <= truth["sample_index"][-1])
+    inside = (epochs["sample_index"] >= truth["sample_index"][0]) & (
+        epochs["sample_index"] <= truth["sample_index"][-1]
+    )
     e = epochs[inside]
     t = e["sample_index"] / fs_hz
     t_k = truth["sample_index"] / fs_hz
@@ -54,7 +58,9 @@ def position_errors(solution: np.ndarray, truth: np.ndarray, fs_hz: float) -> np
     from signals.geodesy import ecef_to_geodetic, ned_matrix
 
     t, t_k = solution["sample_index"] / fs_hz, truth["sample_index"] / fs_hz
-    true = np.stack([hermite(t, t_k, truth["pos_ecef_m"][:, i], truth["vel_ecef_mps"][:, i]) for i in range(3)], axis=1)
+    true = np.stack(
+        [hermite(t, t_k, truth["pos_ecef_m"][:, i], truth["vel_ecef_mps"][:, i]) for i in range(3)], axis=1
+    )
     lat_rad, lon_rad, _ = ecef_to_geodetic(true[:1])
     ned = (solution["pos_ecef_m"] - true) @ ned_matrix(lat_rad[0], lon_rad[0]).T
     return ned[:, [1, 0, 2]] * [1.0, 1.0, -1.0]
@@ -66,5 +72,3 @@ def satellite_truth(h5: h5py.File, system: bytes, prn: int) -> np.ndarray:
         return np.empty(0)
     rows = h5["truth/satellites"][:]
     return rows[(rows["system"] == system) & (rows["prn"] == prn)]
-
-

@@ -27,7 +27,9 @@ def lines(
         allowed = WAVEFORMS[name]
         if waveform is not None and waveform not in allowed:
             if signal is not None:
-                raise ValueError(f"waveform '{waveform}' does not belong to {name}; allowed: {', '.join(allowed)}")
+                raise ValueError(
+                    f"waveform '{waveform}' does not belong to {name}; allowed: {', '.join(allowed)}"
+                )
             continue
         for wave in [waveform] if waveform else allowed:
             rows = _rows(name, wave, prn, top, tiered)
@@ -38,7 +40,8 @@ def lines(
         raise ValueError(f"waveform '{waveform}' belongs to no signal; allowed: BPSK, BOC11, CBOC+, CBOC-")
     text = [f"{'signal':6} {'waveform':8} {'PRN':>4} {'line (kHz)':>11} {'level (dB)':>11}"]
     text += [
-        f"{r['signal']:6} {r['waveform']:8} {r['prn']:4d} {r['freq_hz'] / 1e3:11.2f} {r['level_db']:11.3f}" for r in table
+        f"{r['signal']:6} {r['waveform']:8} {r['prn']:4d} {r['freq_hz'] / 1e3:11.2f} {r['level_db']:11.3f}"
+        for r in table
     ]
     result: dict[str, Any] = {"lines": table, "text": "\n".join(text)}
     return result | ({"figures": drawn} if drawn else {})
@@ -67,7 +70,10 @@ def _draw(directory: Path, signal: str, waveform: str, prn: int, tiered: bool) -
     from sdr.plot import figure
 
     directory.mkdir(parents=True, exist_ok=True)
-    path = directory / f"lines_{signal}_{waveform.replace('+', 'p').replace('-', 'm')}{'_tiered' if tiered else ''}.png"
+    path = (
+        directory
+        / f"lines_{signal}_{waveform.replace('+', 'p').replace('-', 'm')}{'_tiered' if tiered else ''}.png"
+    )
     freq_hz, level_db = code_lines(signal, prn, waveform, tiered=tiered)
     worst = worst_lines(signal, waveform, tiered=tiered)
     with figure(path, f"{signal} {waveform} code spectrum lines", rows=1) as ax:

@@ -15,14 +15,18 @@ SIZE_IN = (9.0, 5.0)
 
 
 @contextlib.contextmanager
-def figure(path: Path, title: str, rows: int = 1, projection: str | None = None, size: tuple[float, float] = SIZE_IN) -> Iterator[Any]:
+def figure(
+    path: Path, title: str, rows: int = 1, projection: str | None = None, size: tuple[float, float] = SIZE_IN
+) -> Iterator[Any]:
     """A figure of ``rows`` axes sharing x, saved to ``path`` and closed on leaving."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     fig = Figure(figsize=size, layout="constrained")
     FigureCanvasAgg(fig)
-    axes = fig.subplots(rows, 1, sharex=rows > 1, subplot_kw={"projection": projection} if projection else None)
+    axes = fig.subplots(
+        rows, 1, sharex=rows > 1, subplot_kw={"projection": projection} if projection else None
+    )
     fig.suptitle(title)
     for ax in np.atleast_1d(axes):
         ax.grid(alpha=0.3)
@@ -174,7 +178,13 @@ def _sky(h5: h5py.File, channels: dict[str, h5py.Group], directory: Path) -> Pat
             color = {b"G": "C0", b"E": "C1"}[system] if name in tracked else "0.6"
             ax.plot(one["azimuth_rad"], zenith_deg, color=color, lw=1)
             ax.plot(one["azimuth_rad"][-1], zenith_deg[-1], "o", color=color)
-            ax.annotate(name, (one["azimuth_rad"][-1], zenith_deg[-1]), xytext=(5, 5), textcoords="offset points", fontsize=8)
+            ax.annotate(
+                name,
+                (one["azimuth_rad"][-1], zenith_deg[-1]),
+                xytext=(5, 5),
+                textcoords="offset points",
+                fontsize=8,
+            )
         ax.set_rlim(0, 90)
         ax.set_rticks([15, 30, 45, 60, 75], labels=["75°", "60°", "45°", "30°", "15°"], fontsize=6)
     return path
@@ -197,11 +207,20 @@ def _position(h5: h5py.File, channels: dict[str, h5py.Group], directory: Path) -
     else:
         mean = solution["pos_ecef_m"].mean(axis=0)
         lat_rad, lon_rad, _ = ecef_to_geodetic(mean[None])
-        enu = ((solution["pos_ecef_m"] - mean) @ ned_matrix(lat_rad[0], lon_rad[0]).T)[:, [1, 0, 2]] * [1, 1, -1]
+        enu = ((solution["pos_ecef_m"] - mean) @ ned_matrix(lat_rad[0], lon_rad[0]).T)[:, [1, 0, 2]] * [
+            1,
+            1,
+            -1,
+        ]
         title = "Position about its mean"
     with figure(path, title, rows=2, size=(9, 7)) as (ax, ax_n):
         for k, name in enumerate(("east", "north", "up")):
-            ax.plot(solution["t_s"], enu[:, k], lw=0.9, label=f"{name}, rms {np.sqrt(np.mean(enu[:, k] ** 2)):.2f} m")
+            ax.plot(
+                solution["t_s"],
+                enu[:, k],
+                lw=0.9,
+                label=f"{name}, rms {np.sqrt(np.mean(enu[:, k] ** 2)):.2f} m",
+            )
         ax.set_ylabel("m")
         ax.legend(fontsize=8)
         ax_n.step(solution["t_s"], solution["n_used"], where="post", label="satellites used")

@@ -22,7 +22,25 @@ if TYPE_CHECKING:
 
 COMMON_RATES_HZ = tuple(
     1e6 * r
-    for r in (2.046, 2.048, 2.5, 2.6, 4.0, 4.092, 4.096, 5.0, 5.456, 6.0, 6.625, 8.0, 8.184, 10.0, 12.0, 12.5, 16.0)
+    for r in (
+        2.046,
+        2.048,
+        2.5,
+        2.6,
+        4.0,
+        4.092,
+        4.096,
+        5.0,
+        5.456,
+        6.0,
+        6.625,
+        8.0,
+        8.184,
+        10.0,
+        12.0,
+        12.5,
+        16.0,
+    )
     + (16.3676, 16.368, 16.3676, 20.0, 20.46, 24.0, 25.0, 26.0, 30.0, 38.192, 40.0, 50.0)
 )
 """Rates that front ends and published data sets use; tried when none is declared."""
@@ -88,7 +106,9 @@ def statistics(iq: np.ndarray) -> dict[str, Any]:
         "dc": dc,
         "rms": float(np.sqrt(rms_i**2 + rms_q**2)),
         "iq_balance_db": float(20 * np.log10(rms_i / rms_q)) if balanced else None,
-        "iq_skew_deg": float(np.degrees(np.arcsin(np.mean((i - dc[0]) * (q - dc[1])) / (rms_i * rms_q)))) if balanced else None,
+        "iq_skew_deg": float(np.degrees(np.arcsin(np.mean((i - dc[0]) * (q - dc[1])) / (rms_i * rms_q))))
+        if balanced
+        else None,
     }
 
 
@@ -138,7 +158,17 @@ def inversion(
         rows = [
             r[0]
             for d in range(dwells)
-            if (r := acquire(iq[:, d * length : (d + 1) * length], d * length, fs_hz, if_hz, sat["signal"], [sat["prn"]], spec)).size
+            if (
+                r := acquire(
+                    iq[:, d * length : (d + 1) * length],
+                    d * length,
+                    fs_hz,
+                    if_hz,
+                    sat["signal"],
+                    [sat["prn"]],
+                    spec,
+                )
+            ).size
             and r[0]["acquired"]
         ]
         if len(rows) < 2:
@@ -174,7 +204,10 @@ def _satellites(iq: np.ndarray, fs_hz: float, if_hz: float) -> list[dict[str, An
             if row["acquired"]:
                 found.append(
                     {"signal": signal, "prn": int(row["prn"])}
-                    | {k: float(row[k]) for k in ("doppler_hz", "code_phase_chips", "cn0_dbhz", "statistic", "threshold")}
+                    | {
+                        k: float(row[k])
+                        for k in ("doppler_hz", "code_phase_chips", "cn0_dbhz", "statistic", "threshold")
+                    }
                 )
     return found
 
@@ -184,11 +217,15 @@ def _guess_format(path: Path, declared: "iffile.Declaration") -> str:
     with path.open("rb") as f:
         head = f.read(1 << 20)
     if len(head) < 4096:
-        raise ValueError(f"'{path}' holds {len(head)} bytes, too few to guess its format; give --format and --fs-hz")
+        raise ValueError(
+            f"'{path}' holds {len(head)} bytes, too few to guess its format; give --format and --fs-hz"
+        )
     head = head[: len(head) // 8 * 8]
     with np.errstate(invalid="ignore", over="ignore"):
         as_float = np.frombuffer(head, "<f4").astype(np.float64)
-        sane = np.isfinite(as_float) & ((as_float == 0) | ((np.abs(as_float) > 1e-9) & (np.abs(as_float) < 1e9)))
+        sane = np.isfinite(as_float) & (
+            (as_float == 0) | ((np.abs(as_float) > 1e-9) & (np.abs(as_float) < 1e9))
+        )
     if sane.mean() > 0.999:
         return "cf32"
     low, high = np.frombuffer(head, "u1").reshape(-1, 2).T
@@ -234,7 +271,9 @@ def _advice(path: Path, result: dict[str, Any], conjugated: bool, tried: list[st
     declaration, sats = result["declaration"], result["satellites"]
     parts = list(tried)
     if not sats:
-        parts.append("no satellite found: check --format, --fs-hz and --if-hz, and whether the antenna saw the sky")
+        parts.append(
+            "no satellite found: check --format, --fs-hz and --if-hz, and whether the antenna saw the sky"
+        )
     elif declaration["inverted"] is None:
         parts.append("spectral inversion undecided: use a longer recording or one with larger Doppler")
     elif declaration["inverted"] and not conjugated:
@@ -253,7 +292,9 @@ def _advice(path: Path, result: dict[str, Any], conjugated: bool, tried: list[st
     elif share > 0.9:
         parts.append("nearly all samples share one level: the gain is too low or the format is wrong")
     if result["spurs"]:
-        parts.append(f"strongest spur {result['spurs'][0]['level_db']:.0f} dB above the floor at {result['spurs'][0]['freq_hz']:.0f} Hz")
+        parts.append(
+            f"strongest spur {result['spurs'][0]['level_db']:.0f} dB above the floor at {result['spurs'][0]['freq_hz']:.0f} Hz"
+        )
     options = f"--format {declaration['format']} --fs-hz {declaration['fs_hz']:.10g} --if-hz {declaration['if_hz']:.10g}"
     parts.append(f"gnssbb receive {path} {options}" + (" --conjugate" if declaration["inverted"] else ""))
     return "; ".join(parts)
@@ -269,8 +310,13 @@ def _text(path: Path, result: dict[str, Any]) -> str:
         f"  rms level     {result['rms']:.3g}, DC {result['dc'][0]:+.3g} {result['dc'][1]:+.3g}, {len(result['levels'])} levels",
     ]
     if result["iq_balance_db"] is not None:
-        rows.append(f"  I/Q           {result['iq_balance_db']:+.2f} dB, skew {result['iq_skew_deg']:+.2f} deg")
-    rows += [f"  spur          {s['freq_hz']:+12.0f} Hz {s['level_db']:5.1f} dB above the floor" for s in result["spurs"]]
+        rows.append(
+            f"  I/Q           {result['iq_balance_db']:+.2f} dB, skew {result['iq_skew_deg']:+.2f} deg"
+        )
+    rows += [
+        f"  spur          {s['freq_hz']:+12.0f} Hz {s['level_db']:5.1f} dB above the floor"
+        for s in result["spurs"]
+    ]
     rows += [
         f"  {s['signal']:5} {s['prn']:3d}     Doppler {s['doppler_hz']:+8.0f} Hz, C/N0 {s['cn0_dbhz']:4.1f} dB-Hz"
         for s in result["satellites"]
@@ -279,7 +325,9 @@ def _text(path: Path, result: dict[str, Any]) -> str:
     return "\n".join(rows)
 
 
-def _draw(directory: Path, iq: np.ndarray, freq_hz: np.ndarray, psd_db: np.ndarray, spurs: list[dict[str, float]]) -> list[Path]:
+def _draw(
+    directory: Path, iq: np.ndarray, freq_hz: np.ndarray, psd_db: np.ndarray, spurs: list[dict[str, float]]
+) -> list[Path]:
     from sdr.plot import figure
 
     directory.mkdir(parents=True, exist_ok=True)
@@ -291,7 +339,13 @@ def _draw(directory: Path, iq: np.ndarray, freq_hz: np.ndarray, psd_db: np.ndarr
     with figure(directory / "levels.png", "Level histogram") as ax:
         for row, name in zip(iq, "IQ"):
             if row.any():
-                ax.hist(row, bins=min(256, len(np.unique(row[:100_000])) or 1), histtype="step", density=True, label=name)
+                ax.hist(
+                    row,
+                    bins=min(256, len(np.unique(row[:100_000])) or 1),
+                    histtype="step",
+                    density=True,
+                    label=name,
+                )
         ax.set(xlabel="level", ylabel="share per level")
         ax.legend()
     return [directory / "spectrum.png", directory / "levels.png"]

@@ -5,6 +5,7 @@ out-of-range key is refused with the key, the value and what is allowed.
 """
 
 import tomllib
+from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -57,37 +58,82 @@ class Scenario(BaseModel):
 
 def built_in() -> list[str]:
     """Names of the scenarios that come with the package."""
-    return sorted(p.name.removesuffix(".toml") for p in (files("sdr") / "scenarios").iterdir() if p.name.endswith(".toml"))
+    return sorted(
+        p.name.removesuffix(".toml")
+        for p in (files("sdr") / "scenarios").iterdir()
+        if p.name.endswith(".toml")
+    )
 
 
-def load(name_or_path: str) -> tuple[Scenario, str]:
+def load(name_or_path: str, overrides: Sequence[str] = ()) -> tuple[Scenario, str]:
     """Read a scenario by built-in name or by path; return it with its text.
 
-    Raises ValueError with one sentence for anything that is not a valid scenario.
+    ``overrides`` are ``key=value`` with the dotted path of the key; they are appended to the text as comments, so that
+    a stored scenario says how it was run. Raises ValueError with one sentence for anything that is not valid.
     """
     path = Path(name_or_path)
     if path.suffix != ".toml" and name_or_path in built_in():
         text = (files("sdr") / "scenarios" / f"{name_or_path}.toml").read_text(encoding="utf-8")
-        return parse(text, name_or_path), text
+        return parse(text, name_or_path, overrides), _with_overrides(text, overrides)
     if not path.is_file():
         raise ValueError(
             f"scenario '{name_or_path}' is neither a file nor a built-in name; built in are: {', '.join(built_in())}"
         )
     if path.stat().st_size > MAX_SCENARIO_BYTES:
-        raise ValueError(f"scenario '{path}' is larger than {MAX_SCENARIO_BYTES} bytes; a scenario is a short TOML text")
+        raise ValueError(
+            f"scenario '{path}' is larger than {MAX_SCENARIO_BYTES} bytes; a scenario is a short TOML text"
+        )
     try:
         text = path.read_text(encoding="utf-8")
     except UnicodeDecodeError:
         raise ValueError(f"scenario '{path}' is not UTF-8 text; a scenario is a TOML file") from None
-    return parse(text, str(path)), text
+    return parse(text, str(path), overrides), _with_overrides(text, overrides)
 
 
-def parse(text: str, origin: str = "scenario") -> Scenario:
+def receiver_only(overrides: Sequence[str] = ()) -> tuple[ReceiverSpec, str]:
+    """The default receiver with ``receiver.*`` overrides, for recordings; and its text."""
+    table: dict[str, Any] = {}
+    _apply(table, overrides)
+    foreign = sorted(set(table) - {"receiver"})
+    if foreign:
+        raise ValueError(
+            f"--set {foreign[0]}...: a recording is received with [receiver] alone; allowed: receiver.*"
+        )
+    return validate(ReceiverSpec, table.get("receiver", {}), "receiver"), _with_overrides("", overrides)
+
+
+def _with_overrides(text: str, overrides: Sequence[str]) -> str:
+    return text + "".join(f"\n# --set {o}" for o in overrides)
+
+
+def _apply(table: dict[str, Any], overrides: Sequence[str]) -> None:
+    """Set dotted keys of ``table``; values are TOML, and what is not is taken as a string."""
+    for override in overrides:
+        key, equals, value = override.partition("=")
+        if not equals or not all(key.split(".")):
+            raise ValueError(
+                f"--set '{override}' is not key=value, e.g. --set receiver.tracking.l1ca.dll_bw_hz=1"
+            )
+        try:
+            parsed = tomllib.loads(f"v = {value}")["v"]
+        except tomllib.TOMLDecodeError:
+            parsed = value
+        *path, last = key.split(".")
+        node: Any = table
+        for part in path:
+            node = node.setdefault(part, {})
+            if not isinstance(node, dict):
+                raise ValueError(f"--set {key}: '{part}' is not a section that can be overridden by key")
+        node[last] = parsed
+
+
+def parse(text: str, origin: str = "scenario", overrides: Sequence[str] = ()) -> Scenario:
     """Build a :class:`Scenario` from TOML text; ``origin`` names it in errors."""
     try:
         table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as err:
         raise ValueError(f"{origin} is not valid TOML: {err}") from None
+    _apply(table, overrides)
     return validate(Scenario, table, origin)
 
 

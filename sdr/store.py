@@ -126,7 +126,12 @@ def _extend(h5: h5py.File, name: str, rows: np.ndarray) -> None:
     if name not in h5:
         chunk = max(1, min(len(rows), (1 << 18) // max(1, rows[:1].nbytes)))
         data = h5.create_dataset(
-            name, data=rows, maxshape=(None, *rows.shape[1:]), chunks=(chunk, *rows.shape[1:]), shuffle=True, compression="lzf"
+            name,
+            data=rows,
+            maxshape=(None, *rows.shape[1:]),
+            chunks=(chunk, *rows.shape[1:]),
+            shuffle=True,
+            compression="lzf",
         )
         if rows.dtype.names:
             data.attrs["units"] = json.dumps({f: unit_of(f) for f in rows.dtype.names})
@@ -148,9 +153,13 @@ def read(path: Path | str) -> h5py.File:
         raise ValueError(f"'{path}' is not an HDF5 file; give a results file written by gnssbb") from None
     if h5.attrs.get("software") != "gnss-baseband":
         h5.close()
-        raise ValueError(f"'{path}' was not written by gnssbb; give a results file written by run, receive or campaign")
+        raise ValueError(
+            f"'{path}' was not written by gnssbb; give a results file written by run, receive or campaign"
+        )
     if int(h5.attrs["schema"]) > SCHEMA_VERSION:
         found = int(h5.attrs["schema"])
         h5.close()
-        raise ValueError(f"'{path}' has schema {found}, this version reads up to {SCHEMA_VERSION}; update gnss-baseband")
+        raise ValueError(
+            f"'{path}' has schema {found}, this version reads up to {SCHEMA_VERSION}; update gnss-baseband"
+        )
     return h5

@@ -1,0 +1,342 @@
+"""The jobs behind the commands: run, simulate, receive, acquire. Each returns the command's JSON object."""
+
+import contextlib
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sdr import iffile, scenario
+from sdr.receiver import Outcome, Receiver
+from sdr.scenario import ReceiverSpec, Scenario
+from sdr.store import Store
+from signals.geodesy import ecef_to_geodetic
+from signals.modulation import SIGNALS
+from signals.source import SyntheticSource
+from tracking.acquisition import AcquisitionSpec, slab_samples
+from tracking.acquisition import acquire as search
+from tracking.channel import STATE_LOCKED
+from tracking.loops import dll_jitter_chips, pll_jitter_cycles
+
+if TYPE_CHECKING:
+    from sdr.__main__ import Recording
+
+SYSTEM_LETTER = {"L1CA": "G", "E1B": "E", "E1C": "E"}
+
+
+def run(
+    name: str,
+    *,
+    output: Path | str | None = None,
+    overrides: Sequence[str] = (),
+    threads: int = 1,
+    plots: bool = False,
+    quiet: bool = False,
+) -> dict[str, Any]:
+    """Synthesise the scenario ``name`` and receive it in one stream."""
+    spec, text = _scenario(name, overrides, threads)
+    source = SyntheticSource(spec)
+    path = Path(output) if output else Path(f"{spec.name}.h5")
+    with Store(path, command="run", scenario=text, seed=spec.seed) as store:
+        result = _receive(spec.receiver, source, store, spec.name, quiet)
+    return _finish(result, path, plots)
+
+
+def receive(
+    file: Path,
+    recording: "Recording",
+    name: str | None = None,
+    *,
+    output: Path | str | None = None,
+    overrides: Sequence[str] = (),
+    threads: int = 1,
+    plots: bool = False,
+    quiet: bool = False,
+) -> dict[str, Any]:
+    """Receive a recording with the receiver of scenario ``name`` (default: the default receiver)."""
+    spec, text = _receiver(name, overrides, threads)
+    source = iffile.open_recording(file, iffile.declaration(file, recording))
+    path = Path(output) if output else Path.cwd() / (Path(file).stem + ".results.h5")
+    with Store(path, command="receive", scenario=text, seed=None) as store:
+        result = _receive(spec, source, store, Path(file).name, quiet)
+    return _finish(result, path, plots)
+
+
+def simulate(
+    name: str, output: Path, *, overrides: Sequence[str] = (), threads: int = 1, quiet: bool = False
+) -> dict[str, Any]:
+    """Write the scenario's samples as a recording, and the truth in HDF5 beside it."""
+    spec, text = _scenario(name, overrides, threads)
+    source = SyntheticSource(spec)
+    begin = time.perf_counter()
+    base = (
+        output.with_suffix("") if output.suffix in (".sigmf-meta", ".sigmf-data", ".bin", ".h5") else output
+    )
+    truth_path = base.with_name(base.name + ".truth.h5")
+    with (
+        iffile.create_recording(base, source, spec) as writer,
+        Store(truth_path, command="simulate", scenario=text, seed=spec.seed) as store,
+        _progress(spec.name, source.n_samples, quiet) as advance,
+    ):
+        while (read := source.read(round(0.1 * source.fs_hz))) is not None:
+            writer.write(read[1])
+            _store_truth(store, source)
+            if store.due():
+                store.checkpoint()
+            advance(read[0] + read[1].shape[1])
+    elapsed = time.perf_counter() - begin
+    files = [str(p) for p in writer.files] + [str(truth_path)]
+    duration_s = source.n_samples / source.fs_hz
+    satellites = [
+        {"signal": s.signal, "prn": s.prn, "cn0_dbhz": float(s.cn0_dbhz)} for s in source.sky.satellites
+    ]
+    text_out = f"{duration_s:g} s, {source.n_samples} samples, {len(satellites)} satellites, {duration_s / elapsed:.1f} times real time\n"
+    return {
+        "files": files,
+        "samples": source.n_samples,
+        "duration_s": duration_s,
+        "satellites": satellites,
+        "real_time_factor": duration_s / elapsed,
+        "text": text_out + "\n".join(f"  {f}" for f in files),
+    }
+
+
+def acquire(
+    file: Path, recording: "Recording", signals: Sequence[str], doppler_hz: float | None, p_fa: float | None
+) -> dict[str, Any]:
+    """Search the start of a recording for satellites."""
+    unknown = [s for s in signals if s not in SIGNALS]
+    if unknown:
+        raise ValueError(f"signal '{unknown[0]}' is not known; allowed: {', '.join(SIGNALS)}")
+    given = {"doppler_range_hz": doppler_hz, "p_fa": p_fa}
+    spec = scenario.validate(AcquisitionSpec, {k: v for k, v in given.items() if v is not None}, "acquire")
+    source = iffile.open_recording(file, iffile.declaration(file, recording))
+    n = max(slab_samples(s, source.fs_hz, spec) for s in signals)
+    n0, iq = _first(source, file, n)
+    rows = np.concatenate([search(iq, n0, source.fs_hz, source.if_hz, s, None, spec) for s in signals])
+    found = [
+        {"signal": r["signal"].decode(), "prn": int(r["prn"])}
+        | {k: float(r[k]) for k in ("doppler_hz", "code_phase_chips", "statistic", "threshold", "cn0_dbhz")}
+        for r in rows[rows["acquired"]]
+    ]
+    table = [
+        f"{len(found)} of {len(rows)} searched satellites found in {iq.shape[1] / source.fs_hz * 1e3:.0f} ms"
+    ]
+    table += [
+        f"  {r['signal']:5} {r['prn']:3d}  Doppler {r['doppler_hz']:+9.1f} Hz  code {r['code_phase_chips']:8.2f} chips"
+        f"  C/N0 {r['cn0_dbhz']:4.1f} dB-Hz  statistic {r['statistic']:.2f} (threshold {r['threshold']:.2f})"
+        for r in found
+    ]
+    return {"satellites": found, "text": "\n".join(table)}
+
+
+def _first(source: Any, file: Path, n: int) -> tuple[int, np.ndarray]:
+    read = source.read(min(n, source.n_samples))
+    if read is None:
+        raise ValueError(f"'{file}' holds no samples in the part that was asked for")
+    return read
+
+
+def _scenario(name: str, overrides: Sequence[str], threads: int) -> tuple[Scenario, str]:
+    spec, text = scenario.load(
+        name, [*overrides, f"receiver.tracking.threads={threads}"] if threads > 1 else overrides
+    )
+    return spec, text
+
+
+def _receiver(name: str | None, overrides: Sequence[str], threads: int) -> tuple[ReceiverSpec, str]:
+    if threads > 1:
+        overrides = [*overrides, f"receiver.tracking.threads={threads}"]
+    if name is not None:
+        spec, text = scenario.load(name, overrides)
+        return spec.receiver, text
+    return scenario.receiver_only(overrides)
+
+
+# -- the common part of run and receive -------------------------------------------------------------------------------
+
+
+class _Tally:
+    """What a run adds up as it goes: for the summary, without keeping the epochs."""
+
+    def __init__(self) -> None:
+        self.locked_s: dict[tuple[str, int], float] = {}
+        self.fixes: list[np.ndarray] = []
+        self.used: dict[str, None] = {}
+
+
+def _receive(spec: ReceiverSpec, source: Any, store: Store, label: str, quiet: bool) -> dict[str, Any]:
+    receiver = Receiver(spec, source)
+    tally = _Tally()
+    begin = time.perf_counter()
+    try:
+        with _progress(label, source.n_samples, quiet) as advance:
+            for outcome in receiver:
+                _store_outcome(store, receiver, outcome, tally)
+                _store_truth(store, source)
+                if store.due():
+                    store.checkpoint()
+                advance(outcome.n_end, f"{len(receiver.channel_of)} tracked, {len(tally.fixes)} fixes")
+    finally:
+        _store_theory(store, receiver)
+    duration_s = receiver.position / receiver.fs_hz
+    result: dict[str, Any] = {
+        "duration_s": duration_s,
+        "real_time_factor": duration_s / (time.perf_counter() - begin),
+        "satellites": receiver.satellites(tally.locked_s),
+    }
+    result["fix"], result["no_fix_reason"] = _fix(receiver, source, tally), None
+    if result["fix"] is None:
+        result["no_fix_reason"] = _why_no_fix(receiver, duration_s, result["satellites"])
+    return result
+
+
+def _store_outcome(store: Store, receiver: Receiver, outcome: Outcome, tally: _Tally) -> None:
+    store.append("acquisition", outcome.found)
+    for row in outcome.found:
+        tally.locked_s.setdefault((row["signal"].decode(), int(row["prn"])), 0.0)
+    channels = receiver.tracker.channels
+    for c, epochs, corr in outcome.epochs:
+        signal, prn = channels["signal"][c].decode(), int(channels["prn"][c])
+        name = f"tracking/{SYSTEM_LETTER[signal]}{prn:02d}_{signal}"
+        store.append(f"{name}/epochs", epochs, signal=signal, prn=prn, fs_hz=receiver.fs_hz)
+        taps = receiver.tracker.taps_chips(c)
+        store.append(
+            f"{name}/corr", corr[:, : len(taps)], taps_chips=taps, waveform=_replica(receiver, signal)
+        )
+        locked = epochs["state"] == STATE_LOCKED
+        tally.locked_s[signal, prn] += float(epochs["n_samples"][locked].sum()) / receiver.fs_hz
+    for rows in outcome.observations:
+        store.append("navigation/observations", rows)
+    for row in outcome.solutions:
+        store.append("navigation/solution", row, fs_hz=receiver.fs_hz)
+        if row["valid"][0]:
+            tally.fixes.append(row)
+            tally.used.update(dict.fromkeys(receiver.navigator.used))
+
+
+def _replica(receiver: Receiver, signal: str) -> str:
+    if signal == "L1CA":
+        return "BPSK"
+    boc = receiver.spec.tracking.e1.replica == "BOC11"
+    return "BOC11" if boc else SIGNALS[signal].waveform
+
+
+def _store_truth(store: Store, source: Any) -> None:
+    truth = getattr(source, "take_truth", None)
+    if truth is not None:
+        satellites, receiver = truth()
+        store.append("truth/satellites", satellites)
+        store.append("truth/receiver", receiver)
+
+
+def _store_theory(store: Store, receiver: Receiver) -> None:
+    """Thermal standard deviations at each channel's last C/N0, for the figures."""
+    replica = receiver.tracker.snapshot(receiver.position)
+    for (signal, prn), c in receiver.channel_of.items():
+        loops = receiver.spec.tracking.l1ca if signal == "L1CA" else receiver.spec.tracking.e1
+        t_s, cn0 = loops.integration_ms * 1e-3, float(replica["cn0_dbhz"][c])
+        if not np.isfinite(cn0) or cn0 < 10.0:
+            continue
+        store.append(
+            f"tracking/{SYSTEM_LETTER[signal]}{prn:02d}_{signal}/epochs",
+            np.empty(0),
+            phase_sigma_cycles=pll_jitter_cycles(cn0, loops.pll_bw_hz, t_s),
+            code_sigma_m=293.05 * dll_jitter_chips(cn0, loops.dll_bw_hz, t_s, loops.early_late_space_chips),
+        )
+
+
+def _fix(receiver: Receiver, source: Any, tally: _Tally) -> dict[str, Any] | None:
+    if not tally.fixes:
+        return None
+    rows = np.concatenate(tally.fixes)
+    mean = rows["pos_ecef_m"].mean(axis=0)
+    lat_rad, lon_rad, height_m = ecef_to_geodetic(mean[None])
+    fix = {
+        "first_s": float(rows["t_s"][0]),
+        "epochs": len(rows),
+        "lat_deg": float(np.degrees(lat_rad[0])),
+        "lon_deg": float(np.degrees(lon_rad[0])),
+        "height_m": float(height_m[0]),
+        "pos_ecef_m": mean.tolist(),
+        "used": list(tally.used),
+    }
+    sky = getattr(source, "sky", None)
+    if sky is not None:
+        truth = sky.receiver(rows["sample_index"] / receiver.fs_hz)
+        error = rows["pos_ecef_m"] - truth["pos_ecef_m"]
+        fix["rms_3d_m"] = float(np.sqrt(np.mean(np.sum(error**2, axis=1))))
+    return fix
+
+
+def _why_no_fix(receiver: Receiver, duration_s: float, satellites: list[dict[str, Any]]) -> str:
+    if not satellites:
+        searched = (
+            "; ".join(receiver.searched) or "nothing: the recording is shorter than one search, or all zeros"
+        )
+        return f"no satellite was found; searched {searched}"
+    locked = [s for s in satellites if s["locked_s"] > 0]
+    with_ephemeris = [s for s in satellites if s["ephemeris"]]
+    if duration_s < 18.0 and not with_ephemeris:
+        return (
+            f"{len(satellites)} satellites were found and {len(locked)} tracked, but {duration_s:.3g} s are too short: an "
+            "ephemeris takes 18 s of GPS or about 25 s of Galileo at the least, from any start up to 30 s and more"
+        )
+    return f"{len(satellites)} satellites found, {len(locked)} tracked, {len(with_ephemeris)} with ephemeris: {receiver.navigator.reason}"
+
+
+def _finish(result: dict[str, Any], path: Path, plots: bool) -> dict[str, Any]:
+    result["output"] = str(path)
+    if plots and result["satellites"]:
+        from sdr.plot import plot
+
+        result["figures"] = [str(p) for p in plot(path)]
+    result["text"] = _summary(result)
+    return result
+
+
+def _summary(result: dict[str, Any]) -> str:
+    rows = [f"{result['duration_s']:g} s in {result['real_time_factor']:.1f} times real time"]
+    rows.append(f"{'satellite':>10} {'locked (s)':>10} {'Doppler (Hz)':>13} {'C/N0 (dB-Hz)':>13}  message")
+    for s in result["satellites"]:
+        numbers = (
+            f"{s['doppler_hz']:+13.1f} {s['cn0_dbhz']:13.1f}"
+            if s["doppler_hz"] is not None
+            else f"{'lost':>13} {'':13}"
+        )
+        health = {True: "healthy", False: "UNHEALTHY", None: ""}[s["healthy"]]
+        message = f"ephemeris {health}" if s["ephemeris"] else "none yet"
+        rows.append(f"{s['signal']:>6} {s['prn']:3d} {s['locked_s']:10.1f} {numbers}  {message}")
+    fix = result["fix"]
+    if fix is None:
+        rows.append(f"no fix: {result['no_fix_reason']}")
+    else:
+        error = f", 3D error {fix['rms_3d_m']:.2f} m rms against truth" if "rms_3d_m" in fix else ""
+        rows.append(
+            f"position {fix['lat_deg']:.7f} deg, {fix['lon_deg']:.7f} deg, {fix['height_m']:.2f} m: {fix['epochs']} fixes "
+            f"from {fix['first_s']:.1f} s on with {len(fix['used'])} satellites{error}"
+        )
+    rows.append(f"results in {result['output']}")
+    rows += [f"  {p}" for p in result.get("figures", [])]
+    return "\n".join(rows)
+
+
+@contextlib.contextmanager
+def _progress(label: str, total: int, quiet: bool) -> Iterator[Callable[..., None]]:
+    """A bar on stderr with the time left; silent when it is not a terminal or not wanted."""
+    import sys
+
+    if quiet or not sys.stderr.isatty():
+        yield lambda done, note="": None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:3.0f} %"))
+    with Progress(
+        *columns, TimeRemainingColumn(), TextColumn("{task.fields[note]}"), console=Console(stderr=True)
+    ) as bar:
+        task = bar.add_task(label, total=total, note="")
+        yield lambda done, note="": bar.update(task, completed=done, note=note)
