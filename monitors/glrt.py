@@ -1,0 +1,254 @@
+"""Matched-subspace detector of code-line interference with the correlation peak projected out.
+
+z = s(direct path, near echoes) + g a(f) + n over the taps d, n with covariance s2 R(d_i - d_j) per component.
+Whitened by W = R^(-1/2), the subspace of H = [R(d + a)] (a: delays of the direct path and near echoes; d > 0
+early) is projected out, and T = max_f |a(f)^H W' P W z|^2 / (2 s2 |P W a(f)|^2), a(f) = exp(-2 pi i f d /
+fc). Scharf & Friedlander, "Matched subspace detectors", IEEE Trans. SP 42(8), 1994, section V, with a
+maximum over f.
+"""
+
+import math
+from typing import Literal
+
+import numpy as np
+from numba import njit
+from pydantic import BaseModel, ConfigDict, Field
+
+from monitors.fft import _checked, to_columns
+from monitors.records import statistics
+from signals.constants import CHIP_RATE_HZ
+from signals.modulation import autocorrelation
+
+__all__ = ["GlrtMonitor", "GlrtRun"]
+
+_BLOCK = 1024
+_GUARD_CHIPS = {"L1CA": (-0.3, 0.0, 0.3, 0.65, 1.0), "E1B": (-0.15, 0.0, 0.15, 0.3, 0.6)}
+
+
+@njit(cache=True, nogil=True, fastmath={"contract", "nnan", "nsz"})
+def _bin_powers(p, q, power):
+    """|y(+f)|^2 and |y(-f)|^2 from the real products p = Br Z, q = Bi Z -> ``power`` (2 F, E)."""
+    n = p.shape[1] // 2
+    n_f = p.shape[0]
+    for k in range(n_f):
+        for e in range(n):
+            pr = p[k, e]
+            pi = p[k, n + e]
+            qr = q[k, e]
+            qi = q[k, n + e]
+            power[k, e] = (pr - qi) * (pr - qi) + (pi + qr) * (pi + qr)
+            power[n_f + k, e] = (pr + qi) * (pr + qi) + (pi - qr) * (pi - qr)
+
+
+@njit(cache=True, nogil=True)
+def _windows(power, n_valid, length, total, filled, out, where):
+    """Sum powers over windows of ``length`` epochs and take the maximum -> number of windows, new fill."""
+    n_bins = power.shape[0]
+    done = 0
+    lo = 0
+    while lo < n_valid:
+        m = min(length - filled, n_valid - lo)
+        for k in range(n_bins):
+            s = total[k]
+            for e in range(lo, lo + m):
+                s += power[k, e]
+            total[k] = s
+        lo += m
+        filled += m
+        if filled == length:
+            best = 0
+            for k in range(1, n_bins):
+                if total[k] > total[best]:
+                    best = k
+            out[done] = total[best]
+            where[done] = best
+            done += 1
+            total[:] = 0.0
+            filled = 0
+    return done, filled
+
+
+@njit(cache=True, nogil=True, fastmath={"contract", "nnan", "nsz"})
+def _peaks(power, best, where):
+    best[:] = np.float32(0.0)
+    where[:] = np.int64(0)
+    for k in range(power.shape[0]):
+        for e in range(power.shape[1]):
+            where[e] = k if power[k, e] > best[e] else where[e]
+            best[e] = max(best[e], power[k, e])
+
+
+class GlrtMonitor(BaseModel):
+    """Whitened matched-subspace test over code-line frequencies, per epoch or summed over a window.
+
+    Statistic: T above; summed over M epochs without phase for ``accumulate_epochs`` = M.
+    Null model: each frequency Exp(1) (a sum of M: Gamma(M)), so threshold = ln(N_eff / P_FA), N_eff the
+    effective number of frequencies (60 to 110 here); constant false-alarm rate, blind to the peak and near
+    echoes. Under a CW of amplitude K on a grid frequency: P_MD = ncx2.cdf(2 threshold, 2, |P W a|^2 K^2 /
+    s2). Cost: two real F x K matrix products per epoch, about 0.3 us at 35 taps and 68 frequencies of each
+    sign.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+    kind: Literal["GLRT"] = "GLRT"
+    guard_chips: tuple[float, ...] | None = None  # delays projected out; None: those of the interference note
+    grid_hz: float = Field(15e3, gt=0)  # taps that span D chips resolve about fc / D
+    max_hz: float = Field(1.023e6, gt=0, le=4e6)
+    accumulate_epochs: int = Field(1, ge=1, le=100_000)
+    noise_variance: float | None = Field(None, gt=0)  # per component; None: from training
+
+    def start(self, taps_chips, integration_s, signal="L1CA", prn=1, waveform=None):
+        """-> GlrtRun."""
+        return GlrtRun(self, np.asarray(taps_chips, float), integration_s, signal, prn, waveform)
+
+
+class GlrtRun:
+    """See ``GlrtMonitor``."""
+
+    def __init__(self, spec, taps_chips, integration_s, signal, prn, waveform):
+        self.spec, self.integration_s, self.taps_chips = spec, integration_s, taps_chips
+        guard = spec.guard_chips
+        if guard is None:
+            guard = _GUARD_CHIPS["L1CA" if signal == "L1CA" else "E1B"]
+        if len(guard) >= len(taps_chips):
+            raise ValueError(f"{len(guard)} guard delays leave nothing of {len(taps_chips)} taps: use fewer")
+        R = autocorrelation(signal, prn, taps_chips[:, None] - taps_chips[None, :], waveform)
+        self.whitener = _inverse_root(R)
+        H = autocorrelation(signal, prn, taps_chips[:, None] + np.array(guard)[None, :], waveform)
+        basis = np.linalg.svd(self.whitener @ H, full_matrices=False)[0]
+        self.projector = np.eye(len(taps_chips)) - basis @ basis.T
+        self.rank = len(taps_chips) - len(guard)
+        self._set_grid()
+        self.noise_variance = spec.noise_variance
+        self._energy, self.count, self.epoch = 0.0, 0, 0
+        self._tail = []
+        self._sum = np.zeros(2 * len(self.frequency_hz))
+        self._filled = 0
+        n_f, K = len(self.frequency_hz), len(taps_chips)
+        self._z = np.empty((K, 2 * _BLOCK), np.float32)
+        self._p, self._q = (np.empty((n_f, 2 * _BLOCK), np.float32) for _ in range(2))
+        self._power = np.empty((2 * n_f, _BLOCK), np.float32)
+
+    def _set_grid(self):
+        spec = self.spec
+        f = spec.grid_hz * np.arange(math.floor(spec.max_hz / spec.grid_hz * (1 + 1e-12)) + 1)
+        PW = self.projector @ self.whitener
+        a = PW @ np.exp(-2j * np.pi * np.outer(self.taps_chips, f) / CHIP_RATE_HZ)
+        gain = np.linalg.norm(a, axis=0)
+        keep = gain > 0.05 * gain.max()  # a line inside the projected subspace cannot be seen
+        self.frequency_hz, self.gain = f[keep], gain[keep]
+        B = (a[:, keep] / gain[keep]).conj().T @ PW
+        self._b_re, self._b_im = B.real.astype(np.float32), B.imag.astype(np.float32)
+        self.operator = PW
+
+    def line_gain(self, frequency_hz):
+        """|P W a(f)|: amplitude of a unit CW at f after whitening and projection."""
+        a = np.exp(-2j * np.pi * self.taps_chips * frequency_hz / CHIP_RATE_HZ)
+        return float(np.linalg.norm(self.operator @ a))
+
+    def powers(self, z):
+        """|y_f|^2 of each epoch, float32 (2 F, E): +f, then -f. ``z`` float32 (K, 2 E), in-phase |
+        quadrature.
+        """
+        n = z.shape[1] // 2
+        if n != self._power.shape[1]:
+            n_f = len(self.frequency_hz)
+            self._p, self._q = (np.empty((n_f, 2 * n), np.float32) for _ in range(2))
+            self._power = np.empty((2 * n_f, n), np.float32)
+        np.matmul(self._b_re, z, out=self._p)
+        np.matmul(self._b_im, z, out=self._q)
+        _bin_powers(self._p, self._q, self._power)
+        return self._power
+
+    def block(self, z):
+        """T of each epoch of a block float32 (K, 2 E) -> float32 (E,)."""
+        power = self.powers(z)
+        best, where = np.empty(power.shape[1], np.float32), np.empty(power.shape[1], np.int64)
+        _peaks(power, best, where)
+        self._where = where
+        return best * np.float32(0.5 / self._variance())
+
+    def _variance(self):
+        if self.noise_variance is None:
+            raise ValueError("the GLRT monitor does not know the noise: call train, or set noise_variance")
+        return self.noise_variance
+
+    def train(self, corr):
+        """Noise variance from what the projection leaves: mean |P W z|^2 / (2 rank); ``corr`` complex64 (n,
+        K).
+        """
+        corr = _checked(corr, len(self.taps_chips))
+        y = corr @ self.operator.T.astype(np.complex64)
+        self._energy += float(np.sum(y.real**2, dtype=float) + np.sum(y.imag**2, dtype=float))
+        self.count += len(corr)
+        if self.spec.noise_variance is None and self.count:
+            self.noise_variance = self._energy / (2 * self.rank * self.count)
+
+    def effective_bins(self, n_draws=200_000, seed=0, tail=1e-3):
+        """N_eff: P(T > t) e^t at the ``tail`` quantile of drawn white noise (single epoch).
+
+        The maximum over a smooth random field is, far out, that of N_eff independent bins.
+        """
+        rng = np.random.Generator(np.random.Philox(seed))
+        # Noise with covariance R: the root of R is the whitener's inverse.
+        root = np.linalg.inv(self.whitener)
+        values = []
+        for _ in range(max(1, n_draws // _BLOCK)):
+            g = rng.standard_normal((len(self.taps_chips), 2 * _BLOCK), np.float32)
+            power = self.powers((root @ g).astype(np.float32))
+            values.append(0.5 * power.max(axis=0))
+        values = np.concatenate(values)
+        t = np.quantile(values, 1 - tail)
+        return float(np.mean(values > t) * math.exp(t))
+
+    def threshold(self, p_fa, n_eff):
+        """t with N_eff Q(M, t) = P_FA (M = 1: ln(N_eff / P_FA)); Q the regularised upper incomplete gamma."""
+        from scipy.special import gammainccinv
+
+        if not 0 < p_fa < 1:
+            raise ValueError(f"p_fa = {p_fa:g} must lie between 0 and 1")
+        return float(gammainccinv(self.spec.accumulate_epochs, min(p_fa / n_eff, 1.0)))
+
+    def miss_probability(self, amplitude, frequency_hz, threshold):
+        """P_MD against a CW of ``amplitude`` at one tap: single bin, so an upper bound when f is on the
+        grid.
+        """
+        from scipy.stats import ncx2
+
+        m = self.spec.accumulate_epochs
+        lam = m * (amplitude * self.line_gain(frequency_hz)) ** 2 / self._variance()
+        return float(ncx2.cdf(2 * threshold, 2 * m, lam))
+
+    def __call__(self, corr, sample_index=None):
+        """STATISTIC, one per epoch or per window of ``accumulate_epochs``; ``corr`` complex64 (n, K)."""
+        corr = _checked(corr, len(self.taps_chips))
+        M = self.spec.accumulate_epochs
+        scale = 0.5 / self._variance()
+        values, bins, ends = [], [], []
+        out, where = np.empty(_BLOCK), np.empty(_BLOCK, np.int64)
+        for lo in range(0, len(corr), _BLOCK):
+            m = min(_BLOCK, len(corr) - lo)
+            to_columns(corr, lo, self._z)
+            first = M - self._filled - 1
+            done, self._filled = _windows(self.powers(self._z), m, M, self._sum, self._filled, out, where)
+            values.append(out[:done] * scale)
+            bins.append(where[:done].copy())
+            ends.append(lo + first + M * np.arange(done))
+        value, ends = np.concatenate(values or [[]]), np.concatenate(ends or [[]]).astype(np.int64)
+        signed_hz = np.concatenate([self.frequency_hz, -self.frequency_hz])
+        hz = signed_hz[np.concatenate(bins).astype(np.int64)] if bins else np.zeros(0)
+        index = None if sample_index is None else np.asarray(sample_index)[ends]
+        result = statistics(value, self.epoch + ends, self.integration_s, hz, index)
+        self.epoch += len(corr)
+        return result
+
+
+def _inverse_root(R):
+    """W with W R W^T = I: inverse Cholesky factor; refuses taps that carry no independent noise."""
+    try:
+        root = np.linalg.cholesky(0.5 * (R + R.T))
+    except np.linalg.LinAlgError:
+        raise ValueError(
+            "the noise of these taps is linearly dependent: use a wider tap spacing for the GLRT"
+        ) from None
+    return np.linalg.inv(root)
