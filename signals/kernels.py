@@ -1,8 +1,9 @@
-"""Sample synthesis: thermal noise, satellites and the quantiser, in blocks that never depend on how they are asked for.
+"""Sample synthesis: thermal noise, satellites and the quantiser.
 
-Samples have an absolute index n and are made in blocks of BLOCK that start at multiples of BLOCK, always whole, so
-that every sample has the same bits whatever the chunking or the number of threads. Blocks are grouped in *cells* of
-about 20 ms, over which delay, phase and amplitude of every component are polynomials in x = (n - n_cell) / n_per_cell.
+Samples have an absolute index n and are made in blocks of BLOCK that start at multiples of BLOCK, always whole,
+so that every sample has the same bits whatever the chunking or the number of threads. Over a *cell* of time
+(`signals.source.CELL_S`) code phase, carrier phase and amplitude of every component are polynomials in x, which
+runs from 0 to 1; a block belongs to the cell that holds its middle.
 """
 
 import numpy as np
@@ -12,7 +13,15 @@ from numba.extending import intrinsic
 
 from signals.modulation import BLOCK
 
-__all__ = ["COMPONENT", "noise_block", "synthesise", "synthesise_int8"]
+__all__ = [
+    "COMPONENT",
+    "noise_block",
+    "quantise_bits",
+    "quantise_int8",
+    "quantise_int16",
+    "synthesise",
+    "synthesise_int8",
+]
 
 SUB = 256
 """Samples that share one rotation of the carrier base table."""
@@ -37,7 +46,7 @@ COMPONENT = np.dtype(
         ("periods_per_symbol2", "i8"),
     ]
 )
-"""What is constant about a component: one delay and one carrier under one code or two. Symbols repeat cyclically."""
+"""What is constant about a component: one delay and one carrier under one code or two (cyclic symbols)."""
 
 _FAST = {"contract", "nsz", "nnan", "ninf", "arcp", "reassoc", "afn"}
 _F = np.float32
@@ -83,13 +92,13 @@ def _splitmix64(z):
 
 @njit(cache=True, nogil=True, fastmath=_FAST)
 def noise_block(out_i, out_q, hash1, hash2, seed, block, sigma):
-    """Write BLOCK complex Gaussian samples, variance ``sigma``^2 per component, that depend on (seed, block) alone.
+    """Write BLOCK complex Gaussian samples that depend on (seed, block) alone; sigma^2 is the variance of I and of Q.
 
-    Two 32-bit hashes of the sample's place in the block under the block's 64-bit key (splitmix64 of seed and block
-    index), then Box and Muller: r = sqrt(-2 ln u), angle in half a turn and a random sign. Range +-6.5 sigma.
+    Two 32-bit hashes of the sample's place in the block under the block's 64-bit key (splitmix64 of seed and
+    block index), then Box and Muller: r = sqrt(-2 ln u), angle in half a turn and a random sign. Range +-6.5 sigma.
 
-    Hashes: triple32 and the finaliser of MurmurHash3 (public domain; C. Wellons, "Prospecting for hash functions";
-    A. Appleby). Polynomials: minimax, error of log2 below 3e-6, of sine and cosine below 7e-7.
+    Hashes: triple32 (C. Wellons, "Prospecting for hash functions", 2018) and the finaliser of MurmurHash3
+    (A. Appleby). Polynomials: minimax, error of log2 below 3e-6, of sine and cosine below 7e-7.
     """
     key = _splitmix64(_splitmix64(seed + _Q(0x9E3779B97F4A7C15)) + (block + _Q(1)) * _Q(0x9E3779B97F4A7C15))
     key1 = _U(key >> _Q(32))
@@ -108,7 +117,7 @@ def noise_block(out_i, out_q, hash1, hash2, seed, block, sigma):
         h = hash1[k]
         bits = _bits(_F(_I(_I(_I(h >> _I(1)) & _I(0x7FFFFFFF)) | _I(1))))
         w = _float(_I(_I(bits & _I(0x007FFFFF)) | _I(0x3F800000))) - _F(1)
-        # log2 u = exponent + w + w (1 - w) q(w): exact at both ends, so that the relative error is small near u = 1
+        # log2 u = exponent + w + w (1 - w) q(w): exact at both ends, so that r is right near u = 1
         q = _F(0.44254493) + w * (
             _F(-0.27560019) + w * (_F(0.18194844) + w * (_F(-0.095955811) + w * _F(0.025841132)))
         )
@@ -234,7 +243,7 @@ def _place(comp, code, period, x):
 
 @njit(cache=True, nogil=True, fastmath=_FAST)
 def _add_component(out_i, out_q, comp, c, base, rot, j, code, period, codes, symbols, x):
-    """Add one component to the block with its middle at ``x`` and its first sub-block's rotation at ``rot[c, :, j]``."""
+    """Add one component to the block with its middle at ``x`` and its first rotation at ``rot[c, :, j]``."""
     n, at, roll = _place(comp, code[c], period[c], x)
     w1, w2 = _symbol1(comp, symbols, n), _symbol2(comp, symbols, n)
     next1, next2 = w1, w2
@@ -257,17 +266,43 @@ def _add_component(out_i, out_q, comp, c, base, rot, j, code, period, codes, sym
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST)
-def _to_int8(x, gain):
-    """round(gain x), clipped to +-127; adding 1.5 x 2^23 leaves the integer in the low bits of the float."""
-    return np.int8(_bits(min(max(gain * x, _F(-127)), _F(127)) + _F(12582912)))
+def _round(x, gain, limit):
+    """round(gain x), clipped to +-limit; adding 1.5 x 2^23 leaves the integer in the low bits of the float."""
+    return _I(_bits(min(max(gain * x, -limit), limit) + _F(12582912)) - _I(0x4B400000))
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST)
-def _quantise_block(out_i, out_q, to, at, gain):
+def _quantise_block(buf_i, buf_q, out, at, gain):
     for k in range(BLOCK):
-        to[0, _Q(at + k)] = _to_int8(out_i[k], gain)
+        out[0, _Q(at + k)] = np.int8(_round(buf_i[k], gain, _F(127)))
     for k in range(BLOCK):
-        to[1, _Q(at + k)] = _to_int8(out_q[k], gain)
+        out[1, _Q(at + k)] = np.int8(_round(buf_q[k], gain, _F(127)))
+
+
+@njit(cache=True, nogil=True, fastmath=_FAST)
+def quantise_int8(x, out, gain):
+    """Mid-tread: round(gain x), clipped to +-127. x float32 (2, n) -> out int8 (2, n)."""
+    for r in range(2):
+        for k in range(x.shape[1]):
+            out[r, k] = np.int8(_round(x[r, k], gain, _F(127)))
+
+
+@njit(cache=True, nogil=True, fastmath=_FAST)
+def quantise_int16(x, out, gain):
+    """Mid-tread: round(gain x), clipped to +-32767. x float32 (2, n) -> out int16 (2, n)."""
+    for r in range(2):
+        for k in range(x.shape[1]):
+            out[r, k] = np.int16(_round(x[r, k], gain, _F(32767)))
+
+
+@njit(cache=True, nogil=True, fastmath=_FAST)
+def quantise_bits(x, out, gain, bits):
+    """Mid-rise with 2^bits levels, the odd integers: 2 floor(gain x) + 1, clipped. float32 (2, n) -> int8 (2, n)."""
+    top = _F(1 << (bits - 1))
+    for r in range(2):
+        for k in range(x.shape[1]):
+            level = np.floor(min(max(gain * x[r, k], -top), top - _F(0.5)))
+            out[r, k] = np.int8(_I(_F(2) * level + _F(1)))
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST)
@@ -284,8 +319,8 @@ def synthesise(
         Standard deviation of the thermal noise per component; 0 = none.
     n_first : int
         Absolute index of the first sample, a multiple of BLOCK.
-    n_start, n_cell : int
-        Its place in the cell, and the cell's length.
+    n_start, n_cell : float
+        Samples from the cell's beginning to it, and in the cell.
     components : COMPONENT (C,)
     code, carrier : float64 (C, 4)
         Code phase in chips and carrier phase in cycles (IF included): polynomials in x, 0 <= x < 1 over the cell.

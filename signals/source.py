@@ -1,0 +1,316 @@
+"""Slabs of IF samples from a sky: the run that turns delays into samples."""
+
+import math
+from collections import deque
+from collections.abc import Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
+from fractions import Fraction
+
+import numpy as np
+
+from signals.codes import secondary_code
+from signals.constants import CHIP_RATE_HZ, F_L1_HZ
+from signals.frontend import FrontEndSpec
+from signals.inav import encode as encode_inav
+from signals.kernels import COMPONENT, synthesise, synthesise_int8
+from signals.lnav import encode as encode_lnav
+from signals.modulation import BLOCK, code_table
+from signals.records import EPHEMERIS, TRUTH
+from signals.sky import Propagation, Satellite, Sky
+
+__all__ = ["CELLS_PER_S", "SyntheticSource", "amplitude", "truth"]
+
+CELLS_PER_S = 50
+"""Cells of 20 ms: a whole number of code periods of every signal, and the grid of the clock noise."""
+_CELL_CHIPS = CHIP_RATE_HZ / CELLS_PER_S
+_SEGMENT_S = 60
+"""Symbols are encoded for this long at a time, so that memory does not grow with the duration."""
+_LEAD_S = 12
+"""Symbols begin so much before a segment: more than any delay."""
+_LENGTH_CHIPS = {"L1CA": 1023, "E1": 4092}
+
+
+def amplitude(cn0_dbhz, fs_hz: float, is_complex: bool = True):
+    """Amplitude of a carrier whose noise has unit variance per component.
+
+    Complex samples: noise density 2 / fs, power A^2, so A = sqrt(2 C/N0 / fs). Real samples A cos: one-sided
+    density 1 / (fs/2), power A^2 / 2, so A = sqrt(4 C/N0 / fs).
+    """
+    return np.sqrt((2.0 if is_complex else 4.0) * 10.0 ** (np.asarray(cn0_dbhz, float) / 10.0) / fs_hz)
+
+
+def _n_phase(fs_hz: float) -> int:
+    """Rows of the code tables: a rounding of at most c / (2 P fs) = 0.15 m, in at most 256 rows."""
+    return int(2 ** np.clip(math.ceil(math.log2(1e9 / fs_hz)), 5, 8))
+
+
+class SyntheticSource:
+    """Run that makes the samples of a sky, slab after slab, in constant memory.
+
+    Parameters
+    ----------
+    sky : Sky
+    front_end : FrontEndSpec
+    duration_s : float
+    seed : int or SeedSequence
+        Of the thermal noise; two sources of one seed have the same noise whatever else differs.
+    jammers : iterable
+        Runs with ``rms`` (of the sum of I and Q halves, thermal noise = 1) and ``add(iq, n0)``, which adds the
+        samples n0, n0 + 1, .. to float32 (2, n) and depends on nothing but n0.
+    threads : int
+        Cells made ahead in parallel; the bits do not depend on it.
+    noise : bool
+        False leaves the thermal noise out.
+    code_path : optional
+        Directory of the E1 codes (``signals.codes.primary_code``).
+    """
+
+    def __init__(
+        self,
+        sky: Sky,
+        front_end: FrontEndSpec,
+        duration_s: float,
+        seed,
+        jammers: Iterable = (),
+        threads: int = 1,
+        noise: bool = True,
+        code_path=None,
+    ):
+        self.sky, self.spec = sky, front_end
+        self.fs_hz, self.if_hz, self.complex = front_end.fs_hz, front_end.if_hz, front_end.complex
+        self.n_samples = math.floor(duration_s * self.fs_hz + 1e-6)
+        if self.n_samples < 1:
+            raise ValueError(
+                f"duration_s = {duration_s:g} holds no sample at fs_hz = {self.fs_hz:g}: make it longer"
+            )
+        self.jammers = tuple(jammers)
+        seed = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
+        self._seed = seed.generate_state(1, np.uint64)[0]
+        self._sigma = np.float32(1.0 if noise else 0.0)
+        self._codes, self._components = _code_buffer(sky.satellites, self.fs_hz, code_path)
+        self._segment = (-1, np.zeros(0, np.int8), self._components)
+        self.front_end = front_end.start(self._rms(duration_s))
+        self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
+        self._ahead = 2 * threads if threads > 1 else 1
+        self._pending: deque[Future | tuple] = deque()
+        self._next_cell = 0
+        self._cell = np.zeros((2, 0), front_end.dtype)
+        self._used = 0
+        self._position = 0
+
+    def read(self, n: int) -> tuple[int, np.ndarray]:
+        """Next n samples, or what is left: (index of the first, planar (2, n))."""
+        n0 = self._position
+        n = max(min(int(n), self.n_samples - n0), 0)
+        out = np.empty((2, n), self.front_end.dtype)
+        filled = 0
+        while filled < n:
+            if self._used == self._cell.shape[1]:
+                self._cell, self._used = self._pop(), 0
+            take = min(n - filled, self._cell.shape[1] - self._used)
+            out[:, filled : filled + take] = self._cell[:, self._used : self._used + take]
+            filled, self._used = filled + take, self._used + take
+        self._position = n0 + n
+        return n0, out
+
+    def close(self) -> None:
+        """Stop the threads."""
+        if self._pool is not None:
+            self._pool.shutdown(wait=True, cancel_futures=True)
+
+    def truth(self, sample_index) -> np.ndarray:
+        """TRUTH rows of the visible satellites at these samples, by sample, then satellite."""
+        return truth(self.sky, sample_index, self.fs_hz)
+
+    def pvt_truth(self, sample_index) -> np.ndarray:
+        """PVT_TRUTH rows at these samples."""
+        index = np.atleast_1d(np.asarray(sample_index, np.uint64))
+        out = self.sky.receiver(index / self.fs_hz)
+        out["sample_index"] = index
+        return out
+
+    def truth_index(self, rate_hz: float = 10.0) -> np.ndarray:
+        """Samples at which truth is written: every 1 / rate_hz from the first, uint64."""
+        n = math.floor((self.n_samples - 1) * rate_hz / self.fs_hz) + 1
+        return np.ceil(np.arange(n) * (self.fs_hz / rate_hz) - 1e-6).astype(np.uint64)
+
+    def _rms(self, duration_s: float) -> float:
+        """Root of the mean power per component that reaches the gain control."""
+        t = np.linspace(0.0, duration_s, 9)
+        sky = self.sky.propagate(t)
+        power = np.where(sky.visible, amplitude(sky.cn0_dbhz, self.fs_hz, self.complex) ** 2 / 2, 0.0)
+        jamming = sum(j.rms**2 for j in self.jammers)
+        return math.sqrt(1.0 + power.sum(axis=0).mean() + jamming)
+
+    def _pop(self) -> np.ndarray:
+        while (
+            len(self._pending) < self._ahead and self._first_block(self._next_cell) * BLOCK < self.n_samples
+        ):
+            job = self._prepare(self._next_cell)
+            self._pending.append(job if self._pool is None else self._pool.submit(self._make, *job))
+            self._next_cell += 1
+        head = self._pending.popleft()
+        return self._make(*head) if isinstance(head, tuple) else head.result()
+
+    def _first_block(self, cell: int) -> int:
+        """First block with its middle at or after the beginning of the cell."""
+        return max(math.ceil(Fraction(self.fs_hz) * cell / (CELLS_PER_S * BLOCK) - Fraction(1, 2)), 0)
+
+    def _prepare(self, cell: int) -> tuple:
+        """All that the kernel needs for one cell; what is slow and what is shared is done here, in order."""
+        first, last = self._first_block(cell), self._first_block(cell + 1)
+        code, carrier, gain = self._polynomials(cell)
+        symbols, components = self._symbols(cell // (CELLS_PER_S * _SEGMENT_S))
+        periods = np.round(cell * _CELL_CHIPS / components["code_length_chips"]).astype(np.int64)
+        n_start = float(first * BLOCK - Fraction(self.fs_hz) * cell / CELLS_PER_S)
+        keep = np.flatnonzero(gain.any(axis=1))
+        return (
+            first,
+            last,
+            n_start,
+            components[keep],
+            code[keep],
+            carrier[keep],
+            gain[keep],
+            periods[keep],
+            symbols,
+        )
+
+    def _polynomials(self, cell: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Cubics through delays and rates at both ends of the cell: code chips, carrier cycles; amplitude line."""
+        sky = self.sky.propagate(np.array([cell, cell + 1]) / CELLS_PER_S)
+        code = -CHIP_RATE_HZ * _hermite(sky.delay_s, sky.delay_rate_s_s)
+        code[:, 1] += _CELL_CHIPS
+        carrier = -F_L1_HZ * _hermite(sky.phase_delay_s, sky.phase_delay_rate_s_s)
+        carrier[:, 0] += math.fmod(cell * math.fmod(self.if_hz / CELLS_PER_S, 1.0), 1.0)
+        carrier[:, 0] -= np.floor(carrier[:, 0])
+        carrier[:, 1] += self.if_hz / CELLS_PER_S
+        ends = amplitude(sky.cn0_dbhz, self.fs_hz, self.complex) * sky.visible.all(axis=1, keepdims=True)
+        return code, carrier, np.column_stack([ends[:, 0], ends[:, 1] - ends[:, 0]])
+
+    def _symbols(self, segment: int) -> tuple[np.ndarray, np.ndarray]:
+        """Flat symbols of a segment and the components that point into them."""
+        if self._segment[0] != segment:
+            start_s = segment * _SEGMENT_S - _LEAD_S
+            parts, components = [], self._components.copy()
+            at = 0
+            for row, satellite in enumerate(self.sky.satellites):
+                for k, (values, first, periods) in enumerate(_messages(self.sky, satellite, start_s), 1):
+                    components[f"symbols{k}"][row], components[f"n_symbols{k}"][row] = at, len(values)
+                    components[f"first_period{k}"][row] = first
+                    components[f"periods_per_symbol{k}"][row] = periods
+                    parts.append(values)
+                    at += len(values)
+            self._segment = (segment, np.concatenate(parts), components)
+        return self._segment[1], self._segment[2]
+
+    def _make(self, first, last, n_start, components, code, carrier, gain, periods, symbols) -> np.ndarray:
+        n = (last - first) * BLOCK
+        args = (
+            self._seed, self._sigma, first * BLOCK, n_start, self.fs_hz / CELLS_PER_S,
+            components, code, carrier, gain, periods, self._codes, symbols,
+        )  # fmt: skip
+        if self.spec.bits == 8 and not self.jammers and self.complex:
+            out = np.empty((2, n), np.int8)
+            synthesise_int8(out, self.front_end.gain, *args)
+            return out
+        iq = np.empty((2, n), np.float32)
+        synthesise(iq, *args)
+        for jammer in self.jammers:
+            jammer.add(iq, first * BLOCK)
+        if not self.complex:
+            iq[1] = 0.0
+        return self.front_end(iq)
+
+
+def _hermite(value: np.ndarray, rate: np.ndarray) -> np.ndarray:
+    """Coefficients (S, 4) in x of the cubic with these values and rates (per second) at both ends of a cell."""
+    v0, v1 = value[:, 0], value[:, 1]
+    d0, d1 = rate[:, 0] / CELLS_PER_S, rate[:, 1] / CELLS_PER_S
+    rise = v1 - v0
+    return np.column_stack([v0, d0, 3.0 * rise - 2.0 * d0 - d1, d0 + d1 - 2.0 * rise])
+
+
+def _signals_of(satellite: Satellite) -> tuple[str, ...]:
+    return ("L1CA",) if satellite.system == "G" else ("E1B", "E1C")
+
+
+def _code_buffer(satellites, fs_hz: float, path) -> tuple[np.ndarray, np.ndarray]:
+    """Code tables of all satellites in one flat buffer, and their COMPONENT rows without symbols."""
+    components = np.zeros(len(satellites), COMPONENT)
+    components["code2"] = -1
+    parts, at = [], 0
+    for row, satellite in enumerate(satellites):
+        for k, signal in enumerate(_signals_of(satellite), 1):
+            table = code_table(signal, satellite.prn, fs_hz, _n_phase(fs_hz), path=path)
+            # Composite E1: half the power each, E1-C with a minus sign (Galileo OS SIS ICD, 2.3.3).
+            share = {"L1CA": 1.0, "E1B": math.sqrt(0.5), "E1C": -math.sqrt(0.5)}[signal]
+            components[f"code{k}"][row] = at
+            components[f"weight{k}"][row] = share * table.scale
+            components["n_cols"][row] = table.table.shape[1]
+            components["phase_bits"][row] = int(math.log2(table.table.shape[0]))
+            components["samples_per_chip"][row] = table.samples_per_chip
+            components["code_length_chips"][row] = table.code_length_chips
+            parts.append(table.table.ravel())
+            at += table.table.size
+    return np.concatenate(parts), components
+
+
+def _messages(sky: Sky, satellite: Satellite, start_s: int):
+    """(symbols, first code period, code periods per symbol) of each component from scenario time ``start_s`` on."""
+    span_s = _SEGMENT_S + _LEAD_S + 2
+    system = satellite.system
+    per_s, periods = (50, 20) if system == "G" else (250, 1)
+    first = start_s * per_s * periods
+    if satellite.ephemeris is None:
+        rng = np.random.default_rng([0x5C21, ord(system), satellite.prn])
+        data = (rng.integers(0, 2, 64 * per_s) * 2 - 1).astype(np.int8)
+        messages = [(data, 0, periods)]
+    else:
+        encode = encode_lnav if system == "G" else encode_inav
+        almanac = np.array([s.ephemeris for s in sky.satellites if s.ephemeris is not None], EPHEMERIS)
+        almanac = almanac[almanac["system"] == system.encode()]
+        tow = sky.tow_s + start_s
+        week, tow = sky.week + tow // 604_800, tow % 604_800
+        messages = [
+            (encode(satellite.ephemeris, sky.iono_utc, almanac, week, tow, span_s * per_s), first, periods)
+        ]
+    if system == "E":
+        messages.append((secondary_code().astype(np.int8), 0, 1))
+    return messages
+
+
+def truth(sky: Sky, sample_index, fs_hz: float) -> np.ndarray:
+    """TRUTH rows of the visible satellites at these samples, by sample, then satellite."""
+    index = np.atleast_1d(np.asarray(sample_index, np.uint64))
+    t = index / fs_hz
+    now = sky.propagate(t)
+    step_s = 0.01
+    later, before = sky.propagate(t + step_s), sky.propagate(t - step_s)
+    rate_change = (later.phase_delay_rate_s_s - before.phase_delay_rate_s_s) / (2 * step_s)
+    out = np.zeros((len(index), len(sky.satellites)), TRUTH)
+    out["sample_index"], out["t_s"] = index[:, None], t[:, None]
+    for row, satellite in enumerate(sky.satellites):
+        out["prn"][:, row], out["system"][:, row] = satellite.prn, satellite.system.encode()
+        out["code_phase_chips"][:, row] = _code_phase(now, row, index, fs_hz, _LENGTH_CHIPS[satellite.signal])
+    columns = {
+        "delay_s": now.delay_s,
+        "delay_rate_s_s": now.delay_rate_s_s,
+        "carrier_phase_cycles": -F_L1_HZ * now.phase_delay_s,
+        "doppler_hz": -F_L1_HZ * now.phase_delay_rate_s_s,
+        "doppler_rate_hz_s": -F_L1_HZ * rate_change,
+        "cn0_dbhz": now.cn0_dbhz,
+        "elevation_rad": now.elevation_rad,
+        "azimuth_rad": now.azimuth_rad,
+        "range_m": now.range_m,
+    }
+    for name, values in columns.items():
+        out[name] = values.T
+    return out[now.visible.T]
+
+
+def _code_phase(now: Propagation, row: int, index: np.ndarray, fs_hz: float, length: int) -> np.ndarray:
+    """Chips since the last code period began at the satellite; whole seconds hold whole code periods."""
+    whole = np.floor(index / fs_hz)
+    seconds = (index - whole * fs_hz) / fs_hz - now.delay_s[row]
+    return np.mod(CHIP_RATE_HZ * seconds, length)
