@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from signals.constants import GNSS_PI
+from signals.constants import GNSS_PI, SECONDS_PER_WEEK
 
 
 class Field(NamedTuple):
@@ -95,6 +95,16 @@ def unpack(table: tuple[Field, ...], message: int, n_bits: int) -> dict[str, flo
             raw -= 1 << field.n
         values[field.name] = raw if field.lsb == 1.0 else raw * field.lsb
     return values
+
+
+def check_start(where: str, week: int, tow_s: int, n: int) -> None:
+    """Refuse a first week or second that cannot be, and a negative length."""
+    if week != int(week) or week < 0:
+        raise ValueError(f"{where}: week {week} must be a whole number of weeks since 1980-01-06")
+    if tow_s != int(tow_s) or not 0 <= tow_s < SECONDS_PER_WEEK:
+        raise ValueError(f"{where}: tow_s = {tow_s} must be a whole second from 0 to {SECONDS_PER_WEEK - 1}")
+    if n < 0:
+        raise ValueError(f"{where}: {n} symbols cannot be sent, ask for 0 or more")
 
 
 def bits_of(message: int, n_bits: int) -> np.ndarray:

@@ -9,7 +9,7 @@ import numpy as np
 from signals import fec
 from signals.almanac import elements, epoch_on_grid, reference_time
 from signals.constants import GNSS_PI, SECONDS_PER_WEEK
-from signals.fields import Field, bits_of, integer, message_of, pack, unpack
+from signals.fields import Field, bits_of, check_start, integer, message_of, pack, unpack
 from signals.lnav import BROADCAST, nearest_week
 from signals.records import EPHEMERIS, IONO_UTC
 
@@ -331,6 +331,8 @@ def encode(
     records = _sorted_records(ephemeris)
     groups = almanac_groups(almanac)
     where = f"I/NAV of E{records['prn'][0]:02d}"
+    check_start(where, week, tow_s, n_symbols)
+    iono_utc = None if iono_utc is None else np.atleast_1d(iono_utc)[0]
     cache: dict[tuple[int, ...], int] = {}
 
     def static_word(number: int, in_force: int, group: int) -> int:
@@ -363,7 +365,7 @@ def encode(
             number, in_force if number < 7 else 0, sub_frame // 2 % len(groups) if number >= 7 else 0
         )
 
-    start_s = week * SECONDS_PER_WEEK + int(tow_s)
+    start_s = int(week) * SECONDS_PER_WEEK + int(tow_s)
     first = (start_s - 1) // 2  # page whose even part starts at the odd second 2 first + 1
     skip = (start_s - (2 * first + 1)) * PART_SYMBOLS
     pages = []

@@ -9,7 +9,7 @@ from numba import njit
 
 from signals.almanac import elements, epoch_on_grid, reference_time
 from signals.constants import GNSS_PI, SECONDS_PER_WEEK
-from signals.fields import Field, bits_of, integer, pack, unpack
+from signals.fields import Field, bits_of, check_start, integer, pack, unpack
 from signals.records import EPHEMERIS, IONO_UTC
 
 BROADCAST = tuple(name for name in EPHEMERIS.names or () if name != "system")
@@ -359,6 +359,8 @@ def encode(
     records = _sorted_records(ephemeris)
     by_prn = _by_prn(almanac)
     where = f"LNAV of G{records['prn'][0]:02d}"
+    check_start(where, week, tow_s, n_bits)
+    iono_utc = None if iono_utc is None else np.atleast_1d(iono_utc)[0]
     cache: dict[tuple[int, int, int], int] = {}
 
     def body(count: int) -> int:
@@ -375,7 +377,7 @@ def encode(
                 cache[key] = _long_term_page(subframe, page, iono_utc, by_prn)
         return cache[key]
 
-    first = (week * SECONDS_PER_WEEK + int(tow_s)) // 6
+    first = (int(week) * SECONDS_PER_WEEK + int(tow_s)) // 6
     skip = int(tow_s) % 6 * 50
     counts = range(first, first + -(-(skip + n_bits) // SUBFRAME_BITS))
     bits = transmit([body(count) | _header(count, where) for count in counts])

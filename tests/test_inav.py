@@ -158,6 +158,9 @@ def test_other_values_that_cannot_be_sent() -> None:
         stream(30, 0, ephemeris(prn=40))
     with pytest.raises(ValueError, match=r"e1b_hs = 4\.0"):
         stream(30, 0, ephemeris(health=8))
+    for tow_s in (-1, 604_800, 0.5):
+        with pytest.raises(ValueError, match="must be a whole second from 0 to 604799"):
+            inav.encode(ephemeris(), None, None, WEEK, tow_s, 300)
     with pytest.raises(ValueError, match="NaN or infinity"):
         inav.Decoder(5).feed(np.array([1.0, np.nan]), 0)
 

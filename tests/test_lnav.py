@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from signals import lnav
 from signals.almanac import elements
 from signals.constants import EARTH_RATE_RAD_S, MU_GPS_M3_S2
+from signals.fields import pack
 from signals.records import EPHEMERIS, IONO_UTC
 
 WEEK = 2200
@@ -145,6 +146,9 @@ def test_other_values_that_cannot_be_sent() -> None:
         stream(30, 0, ephemeris(iodc=333, iode=78))
     with pytest.raises(ValueError, match="one GPS satellite"):
         stream(30, 0, np.array([ephemeris(5), ephemeris(6)]))
+    for tow_s in (-1, 604_800, 0.5):
+        with pytest.raises(ValueError, match="must be a whole second from 0 to 604799"):
+            lnav.encode(ephemeris(), None, None, WEEK, tow_s, 300)
 
 
 # --- the decoder ---
@@ -316,6 +320,20 @@ def test_health_and_alert() -> None:
     assert (decoder.health, decoder.healthy) == (63, False)
     assert decoder.ephemeris is not None
     assert decoder.ephemeris["health"] == 63
+
+
+def test_alert_flag_makes_a_healthy_satellite_unusable() -> None:
+    values = {"preamble": lnav.PREAMBLE, "tlm_message": 0, "integrity": 0, "anti_spoof": 1}
+    frame = []
+    for k in range(5):
+        header = values | {"tow_count": k + 1, "subframe": k + 1, "alert": k >= 1}
+        body = lnav._ephemeris_subframe(ephemeris(), min(k + 1, 3), WEEK, "test")
+        frame.append(pack(lnav.HEADER, header, 300, "test") | body)
+    bits, decoder = 1 - 2 * lnav.transmit(frame).astype(np.int8), lnav.Decoder(5)
+    decoder.feed(bits[:300], 0)
+    assert (decoder.alert, decoder.healthy) == (False, True)
+    decoder.feed(bits[300:], 300)
+    assert (decoder.alert, decoder.health, decoder.healthy) == (True, 0, False)
 
 
 def test_iono_utc_and_almanac_over_one_master_frame() -> None:
