@@ -1,0 +1,116 @@
+"""Measurement-noise variance from redundant measurements (seed 001, section 3.4): differences cancel all but noise.
+
+Two channels with independent noise: d = v - v', R = E[d^2] / 2 (eq. 37-41). On shared IF samples two identical channels
+have *identical* noise and d = 0, so the live form uses interleaved halves (even and odd code periods, alternate codes
+for 4 ms codes): each half has 2 R, so R = E[d^2] / 4, as long as the squaring loss of a half is negligible (above about
+35 dB-Hz). A CW within a few hundred hertz is common to both halves and largely invisible here: C/N0 and ALS cover it.
+"""
+
+import math
+from typing import Literal
+
+import numpy as np
+from numba import njit
+from pydantic import BaseModel, ConfigDict, Field
+
+PRINTED, UNBIASED, AGE_WEIGHTED = 0, 1, 2
+SCHEMES = {"printed": PRINTED, "unbiased": UNBIASED, "age_weighted": AGE_WEIGHTED}
+
+
+@njit(cache=True, nogil=True)
+def window_variance(ring, count, scheme, decay):
+    """Mean square of the last min(count, N) differences in ``ring`` (N,), newest at (count - 1) mod N.
+
+    printed: / (n - 1), though the mean is known to be zero (seed 001, eq. 39); unbiased: / n; age-weighted: weights
+    decay^age (seed 001, section 5.2.1).
+    """
+    n = min(count, ring.size)
+    acc = 0.0
+    norm = 0.0
+    weight = 1.0
+    for age in range(n):
+        d = ring[(count - 1 - age) % ring.size]
+        acc += weight * d * d
+        norm += weight
+        if scheme == AGE_WEIGHTED:
+            weight *= decay
+    if scheme == PRINTED:
+        norm = n - 1.0
+    return acc / norm if norm > 0.0 else math.nan
+
+
+@njit(cache=True, nogil=True)
+def tuned_variance(ring, count, scheme, decay, divisor, r0, short, ratio):
+    """R_f = R-hat + R0 (seed 001, eq. 56); with ``short`` > 0 R0 follows a rise that the long window lags behind.
+
+    The last ``short`` differences raise R0 by R_short - R-hat when R_short > ratio R-hat.
+    """
+    r_hat = window_variance(ring, count, scheme, decay) / divisor
+    extra = 0.0
+    if short > 0 and count >= short:
+        acc = 0.0
+        for age in range(short):
+            d = ring[(count - 1 - age) % ring.size]
+            acc += d * d
+        r_short = acc / short / divisor
+        if r_short > ratio * r_hat:
+            extra = r_short - r_hat
+    return r_hat + r0 + extra
+
+
+class NoiseRmd(BaseModel):
+    """Scenario section of the redundant-measurement estimator; variances in m^2."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+    kind: Literal["noise_rmd"] = "noise_rmd"
+    window: int = Field(50, ge=2, le=100_000)
+    scheme: Literal["printed", "unbiased", "age_weighted"] = "unbiased"
+    pairing: Literal["interleaved", "two_channel"] = "interleaved"
+    age_half_life: float = Field(10.0, gt=0, description="samples, for age_weighted")
+    r0_m2: float = Field(0.0, ge=0)
+    adaptive_short: int = Field(0, ge=0, le=1000, description="samples of the short window; 0 = R0 fixed")
+    adaptive_ratio: float = Field(2.5, gt=1)
+
+    @property
+    def divisor(self) -> float:
+        """E[d^2] = divisor x R."""
+        return 4.0 if self.pairing == "interleaved" else 2.0
+
+    @property
+    def decay(self) -> float:
+        """Weight ratio of one sample of age."""
+        return 0.5 ** (1.0 / self.age_half_life)
+
+    def start(self, m: int) -> "NoiseRmdRun":
+        """Start on m satellite slots."""
+        return NoiseRmdRun(self, m)
+
+
+class NoiseRmdRun:
+    """Call once per epoch with the differences (m,) of the redundant pairs, metres; NaN where there is none.
+
+    Returns (m,) variances R_f = R-hat + R0; NaN until two differences have been seen. ``clear(i)`` forgets a slot.
+    """
+
+    def __init__(self, spec: NoiseRmd, m: int):
+        self.spec = spec
+        self._ring = np.zeros((m, spec.window))
+        self._count = np.zeros(m, dtype=np.int64)
+
+    def clear(self, i: int) -> None:
+        """Forget slot i (another satellite took it)."""
+        self._count[i] = 0
+
+    def __call__(self, d_m: np.ndarray) -> np.ndarray:
+        """One epoch; see the class."""
+        s = self.spec
+        out = np.full(d_m.size, np.nan)
+        for i in range(d_m.size):
+            if np.isfinite(d_m[i]):
+                self._ring[i, self._count[i] % s.window] = d_m[i]
+                self._count[i] += 1
+            if self._count[i] > 1:
+                scheme, short = SCHEMES[s.scheme], min(s.adaptive_short, s.window)
+                args = scheme, s.decay, s.divisor, s.r0_m2, short, s.adaptive_ratio
+                out[i] = tuned_variance(self._ring[i], self._count[i], *args)
+        return out
