@@ -83,3 +83,22 @@ SOLUTION = np.dtype(
         ("valid", "?"),
     ]
 )
+
+IMU = np.dtype(
+    [
+        ("sample_index", "u8"),  # IF sample at the interval's end
+        ("t_s", "f8"),  # end of the interval over which the sensors integrated
+        ("gyro_rad_s", "f8", 3),  # mean over the interval, body axes forward, right, down; inertial rate
+        ("accel_mps2", "f8", 3),  # mean specific force; at rest and level (0, 0, -g)
+    ]
+)
+"""One output of an inertial measurement unit; its increments are the means times the interval."""
+
+ODOMETER = np.dtype(
+    [
+        ("sample_index", "u8"),
+        ("t_s", "f8"),
+        ("speed_mps", "f8"),  # along the forward axis at t_s; negative in reverse
+    ]
+)
+"""One output of the wheel speed sensor."""
