@@ -11,6 +11,12 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from signals.geodesy import ecef_to_geodetic, ned_matrix
+from signals.trajectory import Motion
+
+G0_MPS2 = 9.80665
+"""Standard gravity (ISO 80000-3)."""
+
 OSCILLATORS = {
     "TCXO": (2e-19, 2e-20),
     "OCXO": (8e-20, 4e-23),
@@ -38,12 +44,25 @@ class ClockSpec(BaseModel):
     noise: Literal["none", "TCXO", "OCXO", "CSAC"] = "none"
     h0_s: float | None = Field(default=None, ge=0.0, le=1e-15)
     h_m2_hz: float | None = Field(default=None, ge=0.0, le=1e-15)
+    g_sensitivity_ned_per_g: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Fractional frequency per g of acceleration, along north, east, down of the place where the run begins."""
 
-    def start(self, seed, duration_s: float) -> Clock:
+    def start(self, seed, duration_s: float, motion: Motion | None = None) -> Clock:
         """Run of the clock over readings [-0.1 s, duration_s + 0.1 s]; bias(0) = bias_s.
 
-        ``seed`` is an int, SeedSequence or Generator and is used only where there is noise.
+        ``seed`` is an int, SeedSequence or Generator and is used only where there is noise; ``motion`` is needed
+        for the acceleration sensitivity, which adds s.(v(t) - v(0)) / g to the bias.
         """
+        clock = self._noisy(seed, duration_s)
+        if not any(self.g_sensitivity_ned_per_g):
+            return clock
+        if motion is None:
+            raise ValueError(
+                "clock.g_sensitivity_ned_per_g needs the motion of the receiver: start it with one"
+            )
+        return _accelerated(clock, motion, np.array(self.g_sensitivity_ned_per_g))
+
+    def _noisy(self, seed, duration_s: float) -> Clock:
         h0, h_m2 = OSCILLATORS.get(self.noise, (0.0, 0.0))
         h0 = h0 if self.h0_s is None else self.h0_s
         h_m2 = h_m2 if self.h_m2_hz is None else self.h_m2_hz
@@ -61,6 +80,20 @@ class ClockSpec(BaseModel):
     def _steady(self, t_s) -> tuple[np.ndarray, np.ndarray]:
         t = np.atleast_1d(np.asarray(t_s, float))
         return self.bias_s + self.drift_s_s * t, np.full(t.size, self.drift_s_s)
+
+
+def _accelerated(clock: Clock, motion: Motion, per_g: np.ndarray) -> Clock:
+    """The clock with its frequency shifted by the acceleration along a direction that is fixed to the Earth."""
+    begin = motion(np.zeros(1))
+    lat, lon, _ = ecef_to_geodetic(begin.pos_ecef_m[0])
+    axis = per_g @ ned_matrix(lat, lon) / G0_MPS2
+
+    def at(t_s) -> tuple[np.ndarray, np.ndarray]:
+        bias, drift = clock(t_s)
+        state = motion(t_s)
+        return bias + (state.vel_ecef_mps - begin.vel_ecef_mps) @ axis, drift + state.acc_ecef_mps2 @ axis
+
+    return at
 
 
 _LEAD = 8  # grid nodes before t = 0

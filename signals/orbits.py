@@ -8,6 +8,7 @@ import math
 
 import numpy as np
 
+from signals import inav, lnav
 from signals.constants import (
     EARTH_RATE_RAD_S,
     F_REL_GALILEO_S_SQRT_M,
@@ -114,50 +115,15 @@ def check_ephemeris(ephemeris: np.ndarray) -> None:
                 )
 
 
-# --- message resolution ----------------------------------------------------------------------------------
-
-_COMMON_LSB = {
-    "sqrt_a_sqrt_m": 2.0**-19,
-    "e": 2.0**-33,
-    "m0_rad": 2.0**-31 * GNSS_PI,
-    "delta_n_rad_s": 2.0**-43 * GNSS_PI,
-    "omega0_rad": 2.0**-31 * GNSS_PI,
-    "i0_rad": 2.0**-31 * GNSS_PI,
-    "omega_rad": 2.0**-31 * GNSS_PI,
-    "omega_dot_rad_s": 2.0**-43 * GNSS_PI,
-    "idot_rad_s": 2.0**-43 * GNSS_PI,
-    "cuc_rad": 2.0**-29,
-    "cus_rad": 2.0**-29,
-    "crc_m": 2.0**-5,
-    "crs_m": 2.0**-5,
-    "cic_rad": 2.0**-29,
-    "cis_rad": 2.0**-29,
-}
-_LSB = {
-    "G": _COMMON_LSB
-    | {"toe_s": 16.0, "toc_s": 16.0, "af0_s": 2.0**-31, "af1_s_s": 2.0**-43, "af2_s_s2": 2.0**-55}
-    | {"tgd_s": 2.0**-31},
-    "E": _COMMON_LSB
-    | {"toe_s": 60.0, "toc_s": 60.0, "af0_s": 2.0**-34, "af1_s_s": 2.0**-46, "af2_s_s2": 2.0**-59}
-    | {"tgd_s": 2.0**-32, "bgd_e5a_s": 2.0**-32},
-}
-_ANGLES = ("m0_rad", "omega0_rad", "omega_rad")
-
-
 def quantise_ephemeris(ephemeris: np.ndarray) -> np.ndarray:
     """Round every element to the resolution of its message, so that truth is what a receiver can decode.
 
-    Resolutions: IS-GPS-200, tables 20-I and 20-III; Galileo OS SIS ICD, tables of words 1-5. Angles are first
-    brought into [-pi, pi).
+    Angles are first brought into [-pi, pi). Raises ValueError naming the field that does not fit.
     """
     out = np.array(np.atleast_1d(ephemeris))
-    for field in _ANGLES:
+    for field in ("m0_rad", "omega0_rad", "omega_rad"):
         out[field] = np.mod(out[field] + GNSS_PI, 2.0 * GNSS_PI) - GNSS_PI
-    for system, table in _LSB.items():
-        rows = out["system"] == system.encode()
-        for field, lsb in table.items():
-            out[field][rows] = np.rint(out[field][rows] / lsb) * lsb
-    return out
+    return np.array([(lnav if e["system"] == b"G" else inav).quantised(e) for e in out], dtype=EPHEMERIS)
 
 
 # --- nominal constellations ------------------------------------------------------------------------------
@@ -181,7 +147,7 @@ _GPS_NODE_DEG = 272.847
 _GALILEO_EPOCH_S = (1924 * 7 + 1) * 86_400.0
 _GALILEO_NODE_DEG = 317.632
 _GALILEO_U_DEG = 225.153
-_GMST_EPOCH_RAD = math.radians(99.8135)  # mean sidereal time at 1980-01-06 00:00 UT1
+_GMST_EPOCH_RAD = math.radians(104.7420)  # mean sidereal time at 1980-01-06 00:00 UT1
 _REFRESH_S = 1200
 
 

@@ -167,7 +167,7 @@ class SkySpec(BaseModel):
             toe = [calendar(r["week"], r["toe_s"]) for r in records]
             raise ValueError(
                 f"{self.path} has no ephemeris of {', '.join(self.signals)} valid at"
-                f" {self.start_time.isoformat()}: its reference times are {min(toe).isoformat()} to {max(toe).isoformat()}"
+                f" {self.start_time.isoformat()}: its reference times are {min(toe)} to {max(toe)}"
             )
         return quantise_ephemeris(np.array(rows)), iono_utc
 

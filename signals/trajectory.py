@@ -342,7 +342,7 @@ def _drive(table, ramp, t, origin, dx, dy, dz):
 
 @njit(cache=True, nogil=True)
 def _drive_kernel(table, ramp, origin, step, out):
-    """RK4 from t = 0 in steps of ``step``; out (n, 9): displacement from the origin, velocity, acceleration."""
+    """RK4 from t = 0 in steps of ``step``; out (n, 9): displacement, velocity, acceleration."""
     x = y = z = 0.0
     for j in range(out.shape[0]):
         t = j * step
@@ -386,7 +386,8 @@ class Recorded(BaseModel):
     """A track from a file: CSV (header ``t_s,x_m,y_m,z_m`` or ``t_s,lat_deg,lon_deg,height_m``) or NMEA GGA.
 
     Scenario time 0 is the first row plus ``skip_s``. A cubic spline (C2) runs through the rows, so that
-    Doppler and acceleration are continuous. Heights are above the ellipsoid (NMEA: altitude plus geoid separation).
+    Doppler and acceleration are continuous.
+    Heights are above the ellipsoid (NMEA: altitude plus geoid separation).
     """
 
     model_config = _FROZEN
@@ -422,7 +423,7 @@ class Recorded(BaseModel):
         if np.any(dt <= 0.0):
             row = int(np.argmax(dt <= 0.0)) + 2
             raise ValueError(
-                f"track {self.path}: the time of row {row}, {t[row - 1]:g} s, repeats or goes back: times must rise"
+                f"track {self.path}: the time of row {row}, {t[row - 1]:g} s, repeats or goes back; it must rise"
             )
         vel = np.diff(pos, axis=0) / dt[:, None]
         speed = np.linalg.norm(vel, axis=1)
