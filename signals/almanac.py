@@ -7,6 +7,15 @@ import numpy as np
 from signals.constants import EARTH_RATE_RAD_S, MU_GALILEO_M3_S2, MU_GPS_M3_S2, SECONDS_PER_WEEK
 
 
+def latest_records(almanac: np.ndarray | None, system: bytes, last_prn: int) -> dict[int, np.void]:
+    """Newest record (by toe) of each satellite 1 .. last_prn of a system, by number."""
+    if almanac is None:
+        return {}
+    chosen = [r for r in np.atleast_1d(almanac) if r["system"] == system and 1 <= r["prn"] <= last_prn]
+    chosen.sort(key=lambda record: (int(record["prn"]), int(record["week"]), float(record["toe_s"])))
+    return {int(record["prn"]): record for record in chosen}
+
+
 def reference_time(almanac: Iterable[np.void], step_s: int) -> tuple[int, int]:
     """(week, s of week) of the latest time of ephemeris, rounded down to a multiple of `step_s`."""
     latest = max(almanac, key=lambda record: (int(record["week"]), float(record["toe_s"])))

@@ -7,10 +7,10 @@ of 128 bits. Weeks are continuous GPS weeks (GST week + 1024) outside the messag
 import numpy as np
 
 from signals import fec
-from signals.almanac import elements, epoch_on_grid, reference_time
+from signals.almanac import elements, epoch_on_grid, latest_records, reference_time
 from signals.constants import GNSS_PI, SECONDS_PER_WEEK
 from signals.fields import Field, bits_of, check_start, integer, message_of, pack, unpack
-from signals.lnav import BROADCAST, nearest_week
+from signals.lnav import BROADCAST, FIRST_WEEK, nearest_week
 from signals.records import EPHEMERIS, IONO_UTC
 
 SYMBOL_MS = 4
@@ -251,9 +251,7 @@ def _ggto(iono_utc: np.void | None, where: str) -> int:
 
 def almanac_groups(almanac: np.ndarray | None) -> list[list[np.void]]:
     """Galileo satellites in threes by number; orbits that the format cannot hold (E14, E18) are left out."""
-    if almanac is None:
-        return [[]]
-    records = [r for r in np.sort(np.atleast_1d(almanac), order="prn") if r["system"] == b"E"]
+    records = latest_records(almanac, b"E", 36).values()
     fit = [r for r in records if abs(r["sqrt_a_sqrt_m"] - REFERENCE_SQRT_A) < 7.99 and r["e"] < 0.031]
     return [fit[i : i + 3] for i in range(0, len(fit), 3)] or [[]]
 
@@ -626,7 +624,7 @@ class Decoder:
         self._assemble(index)
 
     def _reference_week(self) -> int:
-        return self._week_anchor[0] if self._week_anchor else 2048 + 512
+        return self._week_anchor[0] if self._week_anchor else FIRST_WEEK + 512
 
     def _take_utc(self, values: dict[str, float]) -> None:
         for name in ("a0_utc_s", "a1_utc_s_s", "tot_s", "dt_ls_s", "dn", "dt_lsf_s"):

@@ -7,13 +7,15 @@ integer of 300 bits in which the six parity bits of each word are zero until `tr
 import numpy as np
 from numba import njit
 
-from signals.almanac import elements, epoch_on_grid, reference_time
+from signals.almanac import elements, epoch_on_grid, latest_records, reference_time
 from signals.constants import GNSS_PI, SECONDS_PER_WEEK
 from signals.fields import Field, bits_of, check_start, integer, pack, unpack
 from signals.records import EPHEMERIS, IONO_UTC
 
 BROADCAST = tuple(name for name in EPHEMERIS.names or () if name != "system")
 BIT_MS = 20
+FIRST_WEEK = 1900
+"""Default start of the 1024 weeks into which the truncated week is resolved (2016-06-05)."""
 SUBFRAME_BITS = 300
 SUBFRAMES_PER_WEEK = 100_800
 PREAMBLE = 0b10001011
@@ -260,12 +262,6 @@ def _page_18(iono_utc: np.void | None) -> int:
     return pack(PAGE_18, values, SUBFRAME_BITS, "LNAV subframe 4 page 18")
 
 
-def _by_prn(almanac: np.ndarray | None) -> dict[int, np.void]:
-    if almanac is None:
-        return {}
-    return {int(r["prn"]): r for r in np.atleast_1d(almanac) if r["system"] == b"G" and 1 <= r["prn"] <= 32}
-
-
 def _almanac_page(records: dict[int, np.void], prn: int, week: int, toa_s: int) -> int:
     if prn not in records:
         return _dummy_page(0)
@@ -296,7 +292,7 @@ def _health_page(
 
 def _long_term_page(subframe: int, page: int, iono_utc: np.void | None, records: dict[int, np.void]) -> int:
     """Subframe 4 or 5, pages 1..25 (table 20-V)."""
-    week, toa_s = reference_time(list(records.values()), 4096) if records else (0, 0)
+    week, toa_s = reference_time(records.values(), 4096) if records else (0, 0)
     if subframe == 5 and page == 25:
         return _health_page(records, HEALTH_1_24, HEALTH_PAGE_SV_ID, week, toa_s)
     if subframe == 5:
@@ -357,7 +353,7 @@ def encode(
     ValueError naming the field, its value and the range allowed, if a value does not fit its field.
     """
     records = _sorted_records(ephemeris)
-    by_prn = _by_prn(almanac)
+    by_prn = latest_records(almanac, b"G", 32)
     where = f"LNAV of G{records['prn'][0]:02d}"
     check_start(where, week, tow_s, n_bits)
     iono_utc = None if iono_utc is None else np.atleast_1d(iono_utc)[0]
@@ -414,8 +410,8 @@ class Decoder:
     Parameters
     ----------
     prn : satellite.
-    first_week : the ten bits of the week are resolved into first_week .. first_week + 1023 (2048 =
-        2019-04-07).
+    first_week : the ten bits of the week are resolved into first_week .. first_week + 1023; the default holds
+        for signals of 2016-06 to 2036-01. Older or later recordings need another.
 
     Attributes
     ----------
@@ -432,7 +428,7 @@ class Decoder:
     symbols_per_week = SECONDS_PER_WEEK * 1000 // BIT_MS
     lost_after = 3  # subframes without a valid header
 
-    def __init__(self, prn: int, first_week: int = 2048):
+    def __init__(self, prn: int, first_week: int = FIRST_WEEK):
         self.prn = prn
         self.first_week = first_week
         self.ephemeris: np.void | None = None

@@ -366,7 +366,8 @@ def test_week_end() -> None:
 def test_almanac_of_four_satellites_takes_two_minutes() -> None:
     records = [ephemeris(prn, health=4 * (prn == 8)) for prn in (2, 5, 8, 33)]
     odd_orbit = ephemeris(14, sqrt_a_sqrt_m=5289.3, e=0.16)  # as E14 and E18: the format cannot hold it
-    almanac = np.array([*records, odd_orbit])
+    outdated = ephemeris(8, toe_s=600.0, m0_rad=3.0)
+    almanac = np.array([*records, odd_orbit, outdated])
     decoder = inav.Decoder(5)
     decoder.feed(stream(125, 0, almanac=almanac), 0)
     assert sorted(decoder.almanac) == [2, 5, 8, 33]

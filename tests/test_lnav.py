@@ -307,7 +307,7 @@ def test_week_of_toe_around_the_roll_over(record: np.void) -> None:
 def test_week_era() -> None:
     """Ten bits of week: 1200 and 2224 look alike; the caller's first week decides."""
     bits = stream(60, 0, ephemeris(week=1200), week=1200)
-    for first_week, week in ((2048, 2224), (1024, 1200)):
+    for first_week, week in ((lnav.FIRST_WEEK, 2224), (1024, 1200), (1200, 1200), (1201, 2224)):
         decoder = lnav.Decoder(5, first_week)
         decoder.feed(bits, 0)
         assert decoder.week == week
