@@ -4,14 +4,14 @@ All standardise their quantity by its training, (x - mean) / std, signed so that
 except the histogram's chi-square.
 """
 
+import copy
 import math
 from typing import Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from monitors.fft import _checked
-from monitors.records import statistics
+from monitors.records import checked_corr, statistics
 
 __all__ = ["AdcHistogram", "AgcGain", "Cn0Drop", "NoiseFloor", "SignalQuality"]
 
@@ -41,7 +41,18 @@ class _Moments:
         return (x - self.mean) / math.sqrt(self._m2 / (self.count - 1))
 
 
-class _WindowRun:
+class _Restart:
+    """``fresh``: a copy that keeps the training and begins at epoch 0."""
+
+    def fresh(self):
+        """A copy that keeps the training and begins at epoch 0."""
+        run = copy.copy(self)
+        run.epoch = 0
+        run._rest = np.zeros((0, getattr(self, "n_taps", 0)), np.complex64)
+        return run
+
+
+class _WindowRun(_Restart):
     """A scalar of each window of ``length`` epochs, standardised; windows do not overlap."""
 
     def __init__(self, name, quantity, n_taps, length, integration_s):
@@ -58,11 +69,11 @@ class _WindowRun:
 
     def train(self, corr):
         """Add quiet epochs, complex64 (n, K)."""
-        self.moments.add(self.values(_checked(corr, self.n_taps)))
+        self.moments.add(self.values(checked_corr(corr, self.n_taps)))
 
     def __call__(self, corr, sample_index=None):
         """STATISTIC, one per whole window; ``corr`` complex64 (n, K)."""
-        corr = np.concatenate([self._rest, _checked(corr, self.n_taps)])
+        corr = np.concatenate([self._rest, checked_corr(corr, self.n_taps)])
         first = self.epoch - len(self._rest)
         value = self.moments.standardise(self.values(corr))
         ends = first + self.length * np.arange(1, len(value) + 1) - 1
@@ -178,7 +189,7 @@ class AgcGain(_Spec):
         return _AgcRun(integration_s)
 
 
-class _AgcRun:
+class _AgcRun(_Restart):
     def __init__(self, integration_s):
         self.integration_s, self.moments, self.epoch = integration_s, _Moments("AGC"), 0
 
@@ -209,7 +220,7 @@ class AdcHistogram(_Spec):
         return _AdcRun(integration_s)
 
 
-class _AdcRun:
+class _AdcRun(_Restart):
     def __init__(self, integration_s):
         self.integration_s, self.totals, self.epoch = integration_s, None, 0
 

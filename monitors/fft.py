@@ -1,5 +1,6 @@
 """Snapshot FFT monitor of multicorrelator outputs (Ouzeau et al. 2008, section IV; Bastide 2001)."""
 
+import copy
 import math
 from typing import Literal
 
@@ -7,7 +8,7 @@ import numpy as np
 from numba import njit
 from pydantic import BaseModel, ConfigDict, Field
 
-from monitors.records import statistics
+from monitors.records import checked_corr, statistics
 from signals.constants import CHIP_RATE_HZ
 
 __all__ = ["FftMonitor", "FftRun", "to_columns"]
@@ -162,7 +163,7 @@ class FftRun:
 
     def maxima(self, corr):
         """Maximum |DFT| of each epoch and its frequency, float64 (n,) each; ``corr`` complex64 (n, K)."""
-        corr = _checked(corr, self.n_taps)
+        corr = checked_corr(corr, self.n_taps)
         value, hz = np.empty(len(corr)), np.empty(len(corr))
         for lo in range(0, len(corr), _BLOCK):
             if len(self._best) != _BLOCK:
@@ -189,6 +190,13 @@ class FftRun:
         self.mean += delta * n / total
         self.count = total
 
+    def fresh(self):
+        """A copy that keeps the training and begins at epoch 0."""
+        run = copy.copy(self)
+        run.epoch = 0
+        run._buffers(_BLOCK)
+        return run
+
     def __call__(self, corr, sample_index=None):
         """STATISTIC (n,) of complex64 (n, K)."""
         if self.count < 2:
@@ -197,12 +205,3 @@ class FftRun:
         epochs = self.epoch + np.arange(len(value))
         self.epoch += len(value)
         return statistics((value - self.mean) / self.std, epochs, self.integration_s, hz, sample_index)
-
-
-def _checked(corr, n_taps):
-    corr = np.ascontiguousarray(corr, np.complex64)
-    if corr.ndim != 2 or corr.shape[1] != n_taps:
-        raise ValueError(
-            f"correlator outputs have shape {corr.shape}, the monitor was started for (n, {n_taps})"
-        )
-    return corr

@@ -7,6 +7,7 @@ fc). Scharf & Friedlander, "Matched subspace detectors", IEEE Trans. SP 42(8), 1
 maximum over f.
 """
 
+import copy
 import math
 from typing import Literal
 
@@ -14,8 +15,8 @@ import numpy as np
 from numba import njit
 from pydantic import BaseModel, ConfigDict, Field
 
-from monitors.fft import _checked, to_columns
-from monitors.records import statistics
+from monitors.fft import to_columns
+from monitors.records import checked_corr, statistics
 from signals.constants import CHIP_RATE_HZ
 from signals.modulation import autocorrelation
 
@@ -120,14 +121,23 @@ class GlrtRun:
         self.rank = len(taps_chips) - len(guard)
         self._set_grid()
         self.noise_variance = spec.noise_variance
-        self._energy, self.count, self.epoch = 0.0, 0, 0
-        self._tail = []
-        self._sum = np.zeros(2 * len(self.frequency_hz))
-        self._filled = 0
-        n_f, K = len(self.frequency_hz), len(taps_chips)
+        self.chip_rate_hz = CHIP_RATE_HZ
+        self._energy, self.count = 0.0, 0
+        self._restart()
+
+    def _restart(self):
+        n_f, K = len(self.frequency_hz), len(self.taps_chips)
+        self.epoch, self._filled = 0, 0
+        self._sum = np.zeros(2 * n_f)
         self._z = np.empty((K, 2 * _BLOCK), np.float32)
         self._p, self._q = (np.empty((n_f, 2 * _BLOCK), np.float32) for _ in range(2))
         self._power = np.empty((2 * n_f, _BLOCK), np.float32)
+
+    def fresh(self):
+        """A copy that keeps the training and begins at epoch 0."""
+        run = copy.copy(self)
+        run._restart()
+        return run
 
     def _set_grid(self):
         spec = self.spec
@@ -140,6 +150,8 @@ class GlrtRun:
         B = (a[:, keep] / gain[keep]).conj().T @ PW
         self._b_re, self._b_im = B.real.astype(np.float32), B.imag.astype(np.float32)
         self.operator = PW
+        unit = a[:, keep] / gain[keep]
+        self.directions = np.concatenate([unit, unit.conj()], axis=1)
 
     def line_gain(self, frequency_hz):
         """|P W a(f)|: amplitude of a unit CW at f after whitening and projection."""
@@ -168,6 +180,12 @@ class GlrtRun:
         self._where = where
         return best * np.float32(0.5 / self._variance())
 
+    def whitened_statistic(self, y):
+        """T of whitened vectors y = W z, complex (n, K), float64 (n,); slow, for tests and importance
+        sampling.
+        """
+        return 0.5 / self._variance() * np.max(np.abs(y @ self.directions.conj()) ** 2, axis=1)
+
     def _variance(self):
         if self.noise_variance is None:
             raise ValueError("the GLRT monitor does not know the noise: call train, or set noise_variance")
@@ -177,7 +195,7 @@ class GlrtRun:
         """Noise variance from what the projection leaves: mean |P W z|^2 / (2 rank); ``corr`` complex64 (n,
         K).
         """
-        corr = _checked(corr, len(self.taps_chips))
+        corr = checked_corr(corr, len(self.taps_chips))
         y = corr @ self.operator.T.astype(np.complex64)
         self._energy += float(np.sum(y.real**2, dtype=float) + np.sum(y.imag**2, dtype=float))
         self.count += len(corr)
@@ -221,7 +239,7 @@ class GlrtRun:
 
     def __call__(self, corr, sample_index=None):
         """STATISTIC, one per epoch or per window of ``accumulate_epochs``; ``corr`` complex64 (n, K)."""
-        corr = _checked(corr, len(self.taps_chips))
+        corr = checked_corr(corr, len(self.taps_chips))
         M = self.spec.accumulate_epochs
         scale = 0.5 / self._variance()
         values, bins, ends = [], [], []

@@ -10,14 +10,14 @@ cross reflection matrix D minimises the weighted forward and backward residual e
 printed in Ouzeau et al. 2008, table 3: Lambda = Pf^-1/2 Pfb^ Pb^-H/2 from the sample covariances.
 """
 
+import copy
 import math
 from typing import Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from monitors.fft import _checked
-from monitors.records import statistics
+from monitors.records import checked_corr, statistics
 
 __all__ = ["ArModel", "MultichannelAr", "MultichannelArRun", "fit"]
 
@@ -143,10 +143,19 @@ class MultichannelArRun:
         self.hop = max(1, round(spec.hop_s / integration_s))
         _check_length(self.window, self.n_taps, spec.order)
         self.model = None
+        self._parts = []
+        self._restart()
+
+    def _restart(self):
         self.epoch = 0
         self._last = np.zeros((0, self.n_taps), np.complex64)
         self._energy = np.zeros(0)
-        self._parts = []
+
+    def fresh(self):
+        """A copy that keeps the training and begins at epoch 0."""
+        run = copy.copy(self)
+        run._restart()
+        return run
 
     def train(self, corr):
         """Coefficients, residual covariance and reference energy from quiet epochs, complex64 (n, K).
@@ -173,7 +182,7 @@ class MultichannelArRun:
         self._matrices = (scale * whiten @ whole).astype(np.complex64).transpose(0, 2, 1).copy()
 
     def _prepare(self, corr):
-        corr = _checked(corr, self.n_taps)
+        corr = checked_corr(corr, self.n_taps)
         if self.spec.wipe_sign:
             corr = corr * np.where(corr[:, self.prompt].real < 0, -1, 1).astype(np.float32)[:, None]
         return corr if self.spec.input == "IQ" else corr.real.astype(np.complex64)

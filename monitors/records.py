@@ -9,7 +9,7 @@ training and test. Statistics grow with interference; decisions are derived else
 
 import numpy as np
 
-__all__ = ["ALARM", "STATISTIC", "alarms", "statistics"]
+__all__ = ["ALARM", "STATISTIC", "alarms", "checked_corr", "statistics"]
 
 STATISTIC = np.dtype(
     [
@@ -71,3 +71,13 @@ def alarms(statistic, threshold, monitor, signal="", prn=0, gap_s=0.0, t0_s=0.0)
         threshold,
     )
     return out
+
+
+def checked_corr(corr, n_taps):
+    """``corr`` as contiguous complex64 (n, ``n_taps``); refuses another number of taps."""
+    corr = np.ascontiguousarray(corr, np.complex64)
+    if corr.ndim != 2 or corr.shape[1] != n_taps:
+        raise ValueError(
+            f"correlator outputs have shape {corr.shape}, the monitor was started for (n, {n_taps})"
+        )
+    return corr

@@ -46,6 +46,7 @@ __all__ = [
     "TwinRun",
     "code_spectrum",
     "default_taps_chips",
+    "jammer_hz",
     "noise_sigma",
     "worst_line",
 ]
@@ -307,7 +308,7 @@ def _line_vectors(spec, k, taps):
     return (c[:, None] * np.exp(-2j * np.pi * turns)).astype(np.complex64)
 
 
-def _jammer_hz(spec, jammer):
+def jammer_hz(spec, jammer):
     """Frequency at t = 0 relative to the nominal signal."""
     if jammer.freq_hz is not None:
         return jammer.freq_hz - spec.doppler_hz + jammer.offset_hz
@@ -337,7 +338,7 @@ def _cw_rows(spec, rng):
         if not isinstance(j, TwinCW):
             continue
         phase = phase if j.phase_rad is None else j.phase_rad / (2 * math.pi)
-        base = [_jammer_hz(spec, j), j.rate_hz_s, phase, 10 ** (j.js_db / 20), j.start_s, j.end_s]
+        base = [jammer_hz(spec, j), j.rate_hz_s, phase, 10 ** (j.js_db / 20), j.start_s, j.end_s]
         rows.append(base)
         if spec.fs_hz is None:
             continue
@@ -401,7 +402,7 @@ class _SlowNBI:
         self.seed = np.random.SeedSequence(
             stage.nbi_seed.entropy, spawn_key=(*stage.nbi_seed.spawn_key, number)
         )
-        centre = _jammer_hz(spec, jammer)
+        centre = jammer_hz(spec, jammer)
         grid = 1.0 / (_NBI_BLOCK * self.T)
         low, high = centre - 0.5 * jammer.bandwidth_hz, centre + 0.5 * jammer.bandwidth_hz
         self.bins = np.arange(math.ceil(low / grid), math.floor(high / grid) + 1)
@@ -455,7 +456,7 @@ class _WideNBI:
 
     def __init__(self, stage, number, jammer):
         self.jammer, self.key = jammer, np.uint64((int(stage.wide_key) + number) % 2**64)
-        centre = _jammer_hz(stage.spec, jammer)
+        centre = jammer_hz(stage.spec, jammer)
         k = _nbi_lines(stage, centre, jammer.bandwidth_hz)
         vectors = _line_vectors(stage.spec, k, stage.taps).astype(complex)
         power = _sinc2_mean(k * stage.line_hz - centre, jammer.bandwidth_hz, stage.spec.integration_s)
@@ -478,7 +479,7 @@ class _WideNBI:
 
 
 def _nbi(stage, number, jammer):
-    n = len(_nbi_lines(stage, _jammer_hz(stage.spec, jammer), jammer.bandwidth_hz))
+    n = len(_nbi_lines(stage, jammer_hz(stage.spec, jammer), jammer.bandwidth_hz))
     return (_SlowNBI if n <= _SLOW_LINES else _WideNBI)(stage, number, jammer)
 
 
