@@ -191,14 +191,13 @@ ORDER = (
 # --- encoder ---
 
 
-def page_symbols(word: int, secondary_sync: int = 0, page_type: int = 0) -> np.ndarray:
-    """Symbols of one page, even then odd part: uint8 (500,)."""
+def page_symbols(word: int, secondary_sync: int = 0) -> np.ndarray:
+    """Symbols of one nominal page, even then odd part: uint8 (500,)."""
     bits = bits_of(word, WORD_BITS)
     even = np.zeros(120, np.uint8)
-    even[:2] = 0, page_type
     even[2:114] = bits[:112]
     odd = np.zeros(120, np.uint8)
-    odd[:2] = 1, page_type
+    odd[0] = 1
     odd[2:18] = bits[112:]
     odd[82:106] = bits_of(fec.crc24q(np.concatenate((even[:114], odd[:82]))), 24)
     odd[106:114] = bits_of(secondary_sync, 8)
@@ -555,9 +554,9 @@ class Decoder:
             self._take(number, word, index)
             return "page", number, index, True
         if paired and even[1] == odd[1] == 1:
-            self.pages_alert += 1
-        else:
-            self.pages_failed += 1
+            self.pages_alert += 1  # says nothing about sync: its CRC covers the E5b part as well
+            return "page", -1, index, False
+        self.pages_failed += 1
         self._missed += 1
         if self._missed >= self.lost_after:
             self.synced = False

@@ -64,11 +64,13 @@ def interleave(symbols: list[int]) -> list[int]:
     return sent
 
 
-def page(word: list[int], secondary_sync: list[int], odd_middle: list[int] | None = None) -> list[int]:
-    """500 symbols of a nominal I/NAV page that carries 128 bits."""
-    even = [0, 0, *word[:112]]
-    odd = [1, 0, *word[112:], *(odd_middle or 64 * [0])]
-    odd = odd + crc24q(even + odd) + secondary_sync
+def page(
+    word: list[int], secondary_sync: list[int], page_type: int = 0, crc_of: list[int] | None = None
+) -> list[int]:
+    """500 symbols of an I/NAV page that carries 128 bits; `crc_of` = other bits that the CRC is made of."""
+    even = [0, page_type, *word[:112]]
+    odd = [1, page_type, *word[112:], *(64 * [0])]
+    odd = odd + crc24q(crc_of or even + odd) + secondary_sync
     sync = [0, 1, 0, 1, 1, 0, 0, 0, 0, 0]
     return [s for part in (even, odd) for s in sync + interleave(convolve(part + 6 * [0]))]
 

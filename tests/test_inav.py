@@ -59,8 +59,8 @@ def stream(seconds: int, tow_s: int = 0, record=None, **options) -> np.ndarray:
     return signs.astype(np.float32)
 
 
-def page(word: int, **options: int) -> np.ndarray:
-    return 1.0 - 2.0 * inav.page_symbols(word, **options).astype(np.float32)
+def page(word: int) -> np.ndarray:
+    return 1.0 - 2.0 * inav.page_symbols(word).astype(np.float32)
 
 
 def word(number: int, record: np.void | None = None, **extra: float) -> int:
@@ -340,14 +340,16 @@ def test_word_0_counts_only_when_it_says_so(time: int, known: bool) -> None:
 
 
 def test_alert_page_is_dropped_and_harmless() -> None:
-    """Its CRC runs over E5b too: with any CRC it is neither good nor a reason to lose sync."""
+    """Its CRC runs over E5b too: ten in a row are neither good pages nor a reason to lose sync."""
     symbols = stream(60, 1)
+    alert = naive.page(bits_of(0x1234 << 100, 128).tolist(), 8 * [0], page_type=1, crc_of=[1, 0, 1])
     for k in range(3, 13):
-        symbols[500 * k : 500 * k + 500] = page(0x1234 << 100, page_type=1)
+        symbols[500 * k : 500 * k + 500] = 1.0 - 2.0 * np.array(alert)
     decoder = inav.Decoder(5)
     events = decoder.feed(symbols, 0)
     assert [e[1] for e in events[3:13]] == 10 * [-1]
     assert (decoder.pages_alert, decoder.pages_failed, decoder.pages_ok) == (10, 0, 20)
+    assert decoder.synced
     assert same(decoder.ephemeris, ephemeris())
 
 

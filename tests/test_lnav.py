@@ -207,7 +207,7 @@ def test_preambles_inside_the_data_do_not_deceive() -> None:
 
 
 def test_gap_drops_time_until_a_header_agrees() -> None:
-    bits, decoder = stream(90, 0), lnav.Decoder(5)
+    bits, decoder = stream(120, 0), lnav.Decoder(5)
     decoder.feed(bits[:1000], 0)
     assert decoder.tow_of(0) == 0
     decoder.feed(bits[1100:1250], 1100)
@@ -219,11 +219,12 @@ def test_gap_drops_time_until_a_header_agrees() -> None:
     events = decoder.feed(bits[1260:1500], 1260)
     assert events == [("subframe", 5, 1200, True)]
     # an index that starts anew: one header contradicts the old count, the second settles the new one
-    decoder.feed(bits[3000:3300], 0)
+    decoder.feed(bits[3300:3600], 0)
     assert decoder.tow_of(0) is None
-    assert decoder.week is None
-    decoder.feed(bits[3300:3900], 300)
-    assert decoder.tow_of(0) == 60_000
+    decoder.feed(bits[3600:4500], 300)
+    assert decoder.tow_of(0) == 66_000
+    assert decoder.week is None  # the old week belonged to the old numbering
+    decoder.feed(bits[4500:4800], 1200)
     assert decoder.week == WEEK
 
 
