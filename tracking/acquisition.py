@@ -7,13 +7,16 @@ output spans exactly one whole code period and no symbol or secondary chip chang
 4 ms moves the peak by up to 125 Hz); the powers of E1-B and E1-C are added for the pilot.
 
 Statistic. S = sum over K = blocks x components of |y|^2, divided by K times the mean over the code phases of the same
-Doppler bin, its own peak left out: a tone raises its bin's floor together with its bin's cells. On noise K times the
-statistic is Gamma(K, 1), and a search over M cells has P_FA = 1 - exp(-M theta Q(K, u)), where theta is the share of
+Doppler bin, its own peak left out: a tone raises its bin's floor together with its bin's cells. Where the code phases
+of a bin are spread wider than noise spreads them (several tones, other satellites' cross-correlations), what exceeds
+one is divided by that excess. On noise K times the statistic is Gamma(K, 1), and a search over M cells has P_FA = 1 - exp(-M theta Q(K, u)), where theta is the share of
 exceedances whose neighbours stay below (``search_threshold``).
 
 Verification. What stays below its threshold has a second chance: the best code phases of the best Doppler bins are
 looked at again, over longer integrations, in later samples that the search has not seen and where few cells are in
-play. The two stages share the false-alarm rate half and half.
+play. It is allowed a hundredth of the false-alarm rate: long integrations also gather what is not noise.
+
+Strong satellites are taken out of the samples before a verification, and before a weak detection is believed.
 """
 
 import math
@@ -45,9 +48,14 @@ _COMPONENTS = {"L1CA": ("L1CA",), "E1B": ("E1B",), "E1C": ("E1B", "E1C")}
 _REPLICA = {"L1CA": "BPSK", "E1B": "BOC11", "E1C": "BOC11"}
 _BEST_HZ = {"L1CA": 4.096e6, "E1B": 4.0e6, "E1C": 4.0e6}  # 4096 and 2 x 16000 samples: quick transforms
 _BLOCKS = {"L1CA": 10, "E1B": 8, "E1C": 4}  # default search: 10 ms, 36 ms, 20 ms
+_WINDOW_PERIODS = {"L1CA": 4, "E1B": 1, "E1C": 1}  # 4 ms: verification, refinement of the Doppler
 _PIECES_PER_MS = 4
+_WEAK_DB = (
+    12.0  # so much below the strongest, a cross-correlation (C/A -21 dB and up) can pass for a satellite
+)
 _FOLLOW_MS = 40  # samples used for verification, and for refinement
 _CANDIDATES = 8
+_REFERENCES = 32
 
 
 class AcquisitionSpec(BaseModel):
@@ -70,6 +78,8 @@ class AcquisitionSpec(BaseModel):
     """Blocks summed in power. Default: 10 ms (L1CA) or 20 ms (E1), then verification in 40 ms more."""
     p_fa: float = Field(1e-4, gt=0, lt=1)
     """Probability that the search of one PRN without a signal reports one, over the whole search space."""
+    excise_tones: bool = True
+    """Leave out spectral lines that stand 12 dB above their surroundings: two tones can pass for a satellite."""
     workers: int = Field(1, ge=1, le=64)
 
     @model_validator(mode="after")
@@ -186,6 +196,32 @@ def to_working_rate(iq, fs_hz, if_hz, fs_work_hz):
     return x / np.float32(math.sqrt(np.mean(x.astype(np.float64) ** 2) * 2))
 
 
+def _without_tones(x, share=0.003):
+    """The slab without the bins of its spectrum that exceed 16 times the mean of their surroundings.
+
+    Noise exceeds that once in e^16 bins. If more than ``share`` of the bins do, it is not a matter of a few tones
+    (a signal without noise has nothing but lines) and x comes back as it is.
+    """
+    n = fast_length(x.shape[1])
+    source, spectrum, run = row_fft(n)
+    source[:] = x[0, :n] + 1j * x[1, :n]
+    run()
+    power = np.abs(spectrum) ** 2
+    width = max(256, n // 512)
+    local = np.median(power[: n // width * width].reshape(-1, width), axis=1) / math.log(2)
+    lines = np.flatnonzero(power > 16 * np.append(np.repeat(local, width), np.full(n % width, local[-1])))
+    if len(lines) == 0 or len(lines) > share * n:
+        return x
+    back, tones, run = row_fft(n, inverse=True)
+    back[:] = 0
+    back[lines] = spectrum[lines] / n
+    run()
+    out = x.copy()
+    out[0, :n] -= tones.real
+    out[1, :n] -= tones.imag
+    return out
+
+
 @lru_cache(maxsize=8)
 def _interpolator(cutoff, n_phase=256):
     """Hann-windowed sinc, rows of a fraction 0..1 of a sample: float32 (n_phase + 1, taps), each of sum one."""
@@ -232,6 +268,8 @@ def _search(spectra, templates, plan):
     acc = np.empty(plan.n, np.float32)
     guard = math.ceil(1.5 * plan.fs_hz / CHIP_RATE_HZ)
     terms = plan.blocks * len(templates)
+    # The spread over the code phases, 1 / sqrt(K) of the mean on noise, as it is estimated from N / 4 free cells.
+    widest = 1 + 2.5 * math.sqrt((2 + 6 / terms) / (plan.n / 4))
     statistic, lag = np.empty(len(plan.bins)), np.empty(len(plan.bins), np.int64)
     for i, d in enumerate(plan.bins.tolist()):
         whole, h = divmod(d, plan.halves)
@@ -246,8 +284,9 @@ def _search(spectra, templates, plan):
                 kernels.shifted_product(spectra[b, h, p], shift, template, source)
                 run()
                 kernels.add_power(result, moved, acc)
-        peak, lag[i], mean = kernels.row_peak(acc, guard)
-        statistic[i] = peak / mean
+        peak, lag[i], mean, spread = kernels.row_peak(acc, guard)
+        excess = spread / mean * math.sqrt(terms)
+        statistic[i] = 1 + (peak / mean - 1) / (excess if excess > widest else 1.0)
     return _Rows(statistic, lag), terms
 
 
@@ -298,33 +337,62 @@ def _plan_threshold(plan, templates, terms, p_fa):
 
 
 class _Follower:
-    """Correlates one satellite directly: pieces of 1/4 ms along its code, at any Doppler and code phase."""
+    """Correlates one satellite directly: pieces of 1/4 ms along its code, at any Doppler and code phase.
 
-    def __init__(self, x, tables, plan):
-        self.x, self.tables, self.plan = x, tables, plan
+    ``x`` begins ``origin`` samples into the slab; lags and code phases are those of the slab.
+    """
+
+    def __init__(self, x, tables, plan, origin=0):
+        self.x, self.tables, self.plan, self.origin = x, tables, plan, origin
         self.rotated, self.rotated_hz = np.empty_like(x), None
         self.per_period = round(_PIECES_PER_MS * 1e3 * SIGNALS[plan.signal].code_period_s)
 
-    def pieces(self, doppler_hz, lag, offset_chips=0.0, start=0, stop=None):
-        """Complex (components, periods, pieces per period) of the code that starts at ``lag`` (+ whole periods).
-
-        ``offset_chips`` > 0: replica advanced. Only whole code periods between samples start and stop.
-        """
-        plan, table = self.plan, self.tables[0]
+    def rotate(self, doppler_hz):
+        """Take the Doppler off; kept for further code phases."""
         if self.rotated_hz != doppler_hz:
-            kernels.rotate(self.x, doppler_hz / plan.fs_hz, self.rotated)
+            kernels.rotate(self.x, doppler_hz / self.plan.fs_hz, self.rotated)
             self.rotated_hz = doppler_hz
-        rate = CHIP_RATE_HZ * (1 + doppler_hz / F_L1_HZ) / plan.fs_hz
-        period = table.code_length_chips / rate
-        first = lag + max(0, math.ceil((start - lag) / period)) * period
-        periods = math.floor(((self.x.shape[1] if stop is None else stop) - 1 - first) / period)
-        out = np.zeros((len(self.tables), max(0, periods) * self.per_period), complex)
+
+    def layout(self, doppler_hz, lag, stop=None):
+        """(chips per sample, start of the first whole code period in x, its length in samples, whole periods)."""
+        rate = CHIP_RATE_HZ * (1 + doppler_hz / F_L1_HZ) / self.plan.fs_hz
+        period = self.tables[0].code_length_chips / rate
+        first = lag - self.origin
+        first += max(0, math.ceil(-first / period)) * period
+        end = self.x.shape[1] if stop is None else min(stop - self.origin, self.x.shape[1])
+        return rate, first, period, max(0, math.floor((end - 1 - first) / period))
+
+    def pieces(self, doppler_hz, lag, offset_chips=0.0, stop=None):
+        """Complex (components, periods, pieces per period) of the code that starts at ``lag`` + whole periods.
+
+        ``offset_chips`` > 0: replica advanced. Only whole code periods before sample ``stop`` of the slab.
+        """
+        self.rotate(doppler_hz)
+        rate, first, period, periods = self.layout(doppler_hz, lag, stop)
+        out = np.zeros((len(self.tables), periods * self.per_period), complex)
         for row, t in zip(out, self.tables):
             kernels.piece_sums(
                 self.rotated, t.table, t.samples_per_chip, t.code_length_chips,
-                offset_chips - lag * rate, rate, first, period / self.per_period, row,
+                offset_chips - first * rate, rate, first, period / self.per_period, row,
             )  # fmt: skip
-        return out.reshape(len(self.tables), -1, self.per_period)
+        return out.reshape(len(self.tables), periods, self.per_period)
+
+    def cancel(self, doppler_hz, phase_chips):
+        """Take the satellite out of x, with its amplitude as measured in every code period."""
+        lag = -phase_chips * self.plan.fs_hz / (CHIP_RATE_HZ * (1 + doppler_hz / F_L1_HZ))
+        lag -= self.plan.n  # so that the period under way at the start is among them
+        rate, first, period, _ = self.layout(doppler_hz, lag)
+        edges = np.concatenate(
+            [[0.0], first + period * np.arange(math.ceil((self.x.shape[1] - first) / period))]
+        )
+        self.rotate(doppler_hz)
+        for t in self.tables:
+            kernels.subtract_code(
+                self.rotated, t.table, t.samples_per_chip, t.code_length_chips, -first * rate, rate,
+                np.append(edges, self.x.shape[1]),
+            )  # fmt: skip
+        kernels.rotate(self.rotated, -doppler_hz / self.plan.fs_hz, self.x)
+        self.rotated_hz = None
 
 
 def _window_power(pieces, periods, residual_hz, hop=1):
@@ -342,68 +410,88 @@ def _window_power(pieces, periods, residual_hz, hop=1):
     return np.sum(np.abs(windows @ turn) ** 2, axis=0), len(windows)
 
 
-def _noise_power(follower, doppler_hz, lag, periods, count, **span):
-    """Sum of window powers at ``count`` code phases spread over the code away from the signal, and their number."""
+def _noise_powers(follower, doppler_hz, lag, periods, count, stop=None, residual_hz=0.0):
+    """Mean window power at each of ``count`` code phases, spread over the code away from the signal, and windows."""
     length = follower.tables[0].code_length_chips
-    total, windows = 0.0, 0
-    for j in range(1, count + 1):
-        pieces = follower.pieces(doppler_hz, lag, length * j / (count + 1), **span)
-        power, n = _window_power(pieces, periods, 0.0, periods)
-        total, windows = total + power[0], windows + n
-    return total, windows
+    powers = np.empty(count)
+    for j in range(count):
+        pieces = follower.pieces(doppler_hz, lag, length * (j + 1) / (count + 1), stop)
+        power, n = _window_power(pieces, periods, residual_hz, periods)
+        powers[j] = power[0] / n
+    return powers, n
 
 
 def _verify(follower, rows, p_fa):
     """Second look at the best Doppler bins in fresh samples -> (bin index, statistic, threshold) or None.
 
-    Windows of 4 ms. Ratio of the signal's mean window power to that at other code phases: F(2 K, 2 K_ref) on noise.
+    Windows of 4 ms. Ratio of the mean window power to that at other code phases: F(2 K, 2 K_ref) on noise.
     """
-    plan = follower.plan
-    periods = 4 if plan.signal == "L1CA" else 1
-    stop = min(follower.x.shape[1], plan.searched + round(_FOLLOW_MS * 1e-3 * plan.fs_hz))
-    span = {"start": plan.searched, "stop": stop}
-    if stop - plan.searched < 2.2 * periods * plan.n:
+    plan, periods = follower.plan, _WINDOW_PERIODS[follower.plan.signal]
+    if follower.x.shape[1] < 2.2 * periods * plan.n:
         return None
     residual_hz = np.linspace(-0.5, 0.5, 2 + math.ceil(8e-3 * plan.step_hz)) * plan.step_hz
     offsets = [s * 0.25 * CHIP_RATE_HZ / plan.fs_hz for s in (-1, 1)]
-    order = np.argsort(-rows.statistic, kind="stable")[:_CANDIDATES]
-    best = (-1.0, 0, 0)
-    for i in order.tolist():
+    order = np.argsort(-rows.statistic, kind="stable")[:_CANDIDATES].tolist()
+    best = (-1.0, 0, 0.0, 0.0, 0)
+    for i in order:
         for offset in offsets:
-            pieces = follower.pieces(plan.doppler_hz[i], rows.lag[i], offset, **span)
+            pieces = follower.pieces(plan.doppler_hz[i], rows.lag[i], offset)
             power, count = _window_power(pieces, periods, residual_hz, periods)
-            relative = float(np.max(power)) / float(np.sum(np.abs(pieces) ** 2))
-            best = max(best, (relative, i, float(np.max(power)) / count))
-    _, i, power = best
-    noise, n_noise = _noise_power(follower, plan.doppler_hz[i], rows.lag[i], periods, 12, **span)
+            k = int(np.argmax(power))
+            rough = power[k] / np.sum(np.abs(pieces[:, : count * periods // len(pieces)]) ** 2)
+            best = max(best, (float(rough), i, float(power[k]) / count, float(residual_hz[k]), count))
+    rough, i, power, residual, count = best
     cells = len(order) * len(offsets) * len(residual_hz)
-    threshold = float(fdtri(2 * count, 2 * n_noise, math.exp(math.log1p(-p_fa) / cells)))
-    return i, power / (noise / n_noise), threshold
+    threshold = _fresh_threshold(p_fa, cells, count)
+    if rough < 0.7 * threshold:
+        return None
+    noise, _ = _noise_powers(follower, plan.doppler_hz[i], rows.lag[i], periods, _REFERENCES, None, residual)
+    excess = np.std(noise) / np.mean(noise) * math.sqrt(count)
+    widest = 1 + 2.5 * math.sqrt((2 + 6 / count) / _REFERENCES) / 2
+    statistic = 1 + (power / np.mean(noise) - 1) / (excess if excess > widest else 1.0)
+    return i, float(statistic), threshold
+
+
+@lru_cache(maxsize=32)
+def _fresh_threshold(p_fa, cells, count):
+    """Threshold of the ratio of ``count`` window powers to those of the reference code phases."""
+    return float(fdtri(2 * count, 2 * count * _REFERENCES, math.exp(math.log1p(-p_fa) / cells)))
+
+
+def _recheck(follower, doppler_hz, lag):
+    """Statistic of a found signal over the samples of the search, after stronger ones were taken out."""
+    plan = follower.plan
+    stop = max(plan.searched, round(lag) + 2 + plan.hop)
+    power, count = _window_power(follower.pieces(doppler_hz, lag, stop=stop), plan.m, 0.0, plan.m)
+    noise, _ = _noise_powers(follower, doppler_hz, lag, plan.m, 12, stop)
+    return float(power[0] / count / np.mean(noise))
 
 
 def _refine(follower, doppler_hz, lag):
-    """(doppler_hz, code phase at sample 0 in chips, C/N0 in dB-Hz) from up to 40 ms of samples.
+    """(doppler_hz, code phase at sample 0 in chips, C/N0 in dB-Hz) from up to 40 ms; None if no period is whole.
 
     Doppler: peak of the power of 4 ms windows. Code phase: least-squares fit of the ideal correlation function.
     """
     plan = follower.plan
-    periods = 4 if plan.signal == "L1CA" else 1
-    table = follower.tables[0]
-    stop = min(follower.x.shape[1], lag + round((_FOLLOW_MS + 8) * 1e-3 * plan.fs_hz))
-    periods = min(periods, follower.pieces(doppler_hz, lag, stop=stop).shape[1])
+    stop = lag + round((_FOLLOW_MS + 8) * 1e-3 * plan.fs_hz)
+    periods = min(_WINDOW_PERIODS[plan.signal], follower.layout(doppler_hz, lag, stop)[3])
     if periods == 0:
-        raise ValueError("the slab ends before one whole code period of a found signal: give a longer one")
+        return None
     offset = 0.0
     for _ in range(2):
         doppler_hz = _refine_doppler(follower, doppler_hz, lag, offset, periods, stop)
-        offset, power, windows = _refine_code(follower, doppler_hz, lag, periods, stop)
-    noise, n_noise = _noise_power(follower, doppler_hz, lag, 1, 8, stop=stop)
-    one, n_one = _window_power(follower.pieces(doppler_hz, lag, offset, stop=stop), 1, 0.0)
-    snr = one[0] / n_one / (noise / n_noise) - 1
-    cn0_hz = len(_COMPONENTS["E1C" if plan.pad == 2 else "L1CA"]) * snr / SIGNALS[plan.signal].code_period_s
+        offset = _refine_code(follower, doppler_hz, lag, periods, stop)
+    noise, _ = _noise_powers(follower, doppler_hz, lag, 1, 8, stop)
+    one, n_one = _window_power(follower.pieces(doppler_hz, lag, offset, stop), 1, 0.0)
+    snr = one[0] / n_one / np.mean(noise) - 1
     rate = CHIP_RATE_HZ * (1 + doppler_hz / F_L1_HZ) / plan.fs_hz
-    phase = (offset - lag * rate) % table.code_length_chips
-    return doppler_hz, phase, 10 * math.log10(max(cn0_hz, 1.0))
+    phase = (offset - lag * rate) % follower.tables[0].code_length_chips
+    return doppler_hz, phase, _cn0_dbhz(plan, snr, SIGNALS[plan.signal].code_period_s)
+
+
+def _cn0_dbhz(plan, snr, coherent_s):
+    """C/N0 of the whole signal from the mean power over noise of a component."""
+    return 10 * math.log10(max(plan.pad * snr / coherent_s, 1.0))
 
 
 def _refine_doppler(follower, doppler_hz, lag, offset, periods, stop):
@@ -418,20 +506,20 @@ def _refine_doppler(follower, doppler_hz, lag, offset, periods, stop):
 
 
 def _refine_code(follower, doppler_hz, lag, periods, stop):
-    """(offset in chips that the replica needs, power and number of windows there)."""
+    """Offset in chips that the replica needs."""
     plan = follower.plan
     reach, step = (0.75, 1 / 8) if plan.signal == "L1CA" else (0.5, 1 / 16)
     offsets = np.arange(-round(reach / step), round(reach / step) + 1) * step
     powers = []
     for offset in offsets:
-        power, windows = _window_power(follower.pieces(doppler_hz, lag, offset, stop=stop), periods, 0.0)
+        power, windows = _window_power(follower.pieces(doppler_hz, lag, offset, stop), periods, 0.0)
         powers.append(power[0] / windows)
-    noise, n_noise = _noise_power(follower, doppler_hz, lag, periods, 4, stop=stop)
-    amplitude = np.sqrt(np.maximum(np.array(powers) - noise / n_noise, 0.0))
+    noise, _ = _noise_powers(follower, doppler_hz, lag, periods, 4, stop)
+    amplitude = np.sqrt(np.maximum(np.array(powers) - np.mean(noise), 0.0))
     trial = np.arange(-64, 65) / 64 * 0.75 * max(0.25, CHIP_RATE_HZ / plan.fs_hz)
     shape = np.abs(chip_acf(offsets - trial[:, None], _REPLICA[plan.signal]))
     fit = (shape @ amplitude) ** 2 / np.sum(shape**2, axis=1)
-    return _vertex(trial, fit), max(powers), windows
+    return _vertex(trial, fit)
 
 
 def _vertex(x, y):
@@ -480,41 +568,87 @@ def acquire(slab_iq, n0, fs_hz, if_hz, signal, prns=None, spec=None, path=None):
         prns = spec.gps_prns if signal == "L1CA" else spec.galileo_prns
     fs_work = working_rate(signal, fs_hz)
     x = to_working_rate(slab_iq, fs_hz, if_hz, fs_work)
+    if spec.excise_tones:
+        x = _without_tones(x)
     plan = _plan(signal, fs_work, spec, x.shape[1])
+    with ThreadPoolExecutor(spec.workers) as pool:
+        return _acquire(x, plan, spec, [int(prn) for prn in prns], int(n0), path, pool.map)
+
+
+class _Found(NamedTuple):
+    """What is known of one PRN; ``refined`` (Doppler, code phase, C/N0) once it is acquired."""
+
+    tables: list
+    rows: _Rows
+    best: int
+    statistic: float
+    threshold: float
+    refined: tuple | None = None
+
+
+def _acquire(x, plan, spec, prns, n0, path, over):
+    """Search all, take out the strong, look again for the weak and the missing; ``over``: map or a pool's."""
+    two_stages = spec.non_coherent is None
     spectra = _spectra(x, plan)
+    found = list(over(lambda prn: _first_look(x, spectra, plan, prn, spec.p_fa, path), prns))
+    strongest = max((f.refined[2] for f in found if f.refined), default=0.0)
+    strong = [f.refined is not None and f.refined[2] > strongest - _WEAK_DB for f in found]
+    cleaned = x.copy() if any(strong) else x
+    for f, is_strong in zip(found, strong):
+        if is_strong:
+            _Follower(cleaned, f.tables, plan).cancel(*f.refined[:2])
+    follow = plan.searched + round(_FOLLOW_MS * 1e-3 * plan.fs_hz)
+    fresh = np.ascontiguousarray(cleaned[:, plan.searched : follow])
 
-    def one(prn):
-        return _acquire_one(x, spectra, plan, spec, int(prn), int(n0), path)
+    def again(f):
+        if f.refined:
+            return _weak_look(cleaned, f, plan)
+        return _second_look(x, fresh, f, plan, 0.01 * spec.p_fa) if two_stages else f
 
-    if spec.workers == 1:
-        found = [one(prn) for prn in prns]
-    else:
-        with ThreadPoolExecutor(spec.workers) as pool:
-            found = list(pool.map(one, prns))
-    return np.array(found, ACQUISITION)
+    found = list(over(lambda pair: pair[0] if pair[1] else again(pair[0]), zip(found, strong)))
+    out = np.zeros(len(prns), ACQUISITION)
+    for i, (prn, f) in enumerate(zip(prns, found)):
+        phase = -f.rows.lag[f.best] * CHIP_RATE_HZ / plan.fs_hz % f.tables[0].code_length_chips
+        values = f.refined or (plan.doppler_hz[f.best], phase, math.nan)
+        acquired = f.refined is not None
+        out[i] = (plan.signal.encode(), prn, n0, *values, f.statistic, f.threshold, acquired)
+    return out
 
 
-def _acquire_one(x, spectra, plan, spec, prn, n0, path):
-    """Search, verification and refinement of one PRN -> fields of ACQUISITION."""
-    tables = [
-        code_table(name, prn, plan.fs_hz, 16, _REPLICA[plan.signal], path=path)
-        for name in _COMPONENTS[plan.signal]
-    ]
+def _first_look(x, spectra, plan, prn, p_fa, path):
+    """Search, and refinement if the threshold is passed."""
+    names, waveform = _COMPONENTS[plan.signal], _REPLICA[plan.signal]
+    tables = [code_table(name, prn, plan.fs_hz, 16, waveform, path=path) for name in names]
     templates = [_template(table, plan) for table in tables]
     rows, terms = _search(spectra, templates, plan)
-    follower = _Follower(x, tables, plan)
-    two_stages = spec.non_coherent is None
-    p_fa = -math.expm1(0.5 * math.log1p(-spec.p_fa)) if two_stages else spec.p_fa
     best = int(np.argmax(rows.statistic))
-    statistic = float(rows.statistic[best])
     threshold = _plan_threshold(plan, templates, terms, p_fa)
-    if statistic <= threshold and two_stages:
-        second = _verify(follower, rows, p_fa)
-        if second and second[1] > second[2]:
-            best, statistic, threshold = second
-    doppler_hz, lag, cn0_dbhz = float(plan.doppler_hz[best]), int(rows.lag[best]), math.nan
-    phase = -lag * CHIP_RATE_HZ / plan.fs_hz % tables[0].code_length_chips
-    acquired = statistic > threshold
-    if acquired:
-        doppler_hz, phase, cn0_dbhz = _refine(follower, doppler_hz, lag)
-    return plan.signal.encode(), prn, n0, doppler_hz, phase, cn0_dbhz, statistic, threshold, acquired
+    found = _Found(tables, rows, best, float(rows.statistic[best]), threshold)
+    return _accept(x, found, plan) if found.statistic > threshold else found
+
+
+def _accept(x, found, plan):
+    """Refine; a slab without one whole code period leaves the best cell as it is."""
+    doppler_hz, lag = float(plan.doppler_hz[found.best]), int(found.rows.lag[found.best])
+    refined = _refine(_Follower(x, found.tables, plan), doppler_hz, lag)
+    if refined is None:
+        phase = -lag * CHIP_RATE_HZ / plan.fs_hz % found.tables[0].code_length_chips
+        refined = doppler_hz, phase, _cn0_dbhz(plan, found.statistic - 1, plan.hop / plan.fs_hz)
+    return found._replace(refined=refined)
+
+
+def _weak_look(cleaned, found, plan):
+    """Keep a weak detection only if it stands after the strong satellites were taken out."""
+    statistic = _recheck(
+        _Follower(cleaned, found.tables, plan), plan.doppler_hz[found.best], found.rows.lag[found.best]
+    )
+    return found if statistic > found.threshold else found._replace(statistic=statistic, refined=None)
+
+
+def _second_look(x, fresh, found, plan, p_fa):
+    """Verification in fresh samples; the statistic stays that of the search where it fails."""
+    second = _verify(_Follower(fresh, found.tables, plan, plan.searched), found.rows, p_fa)
+    if second is None or second[1] <= second[2]:
+        return found
+    best, statistic, threshold = second
+    return _accept(x, found._replace(best=best, statistic=statistic, threshold=threshold), plan)

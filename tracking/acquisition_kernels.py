@@ -50,19 +50,23 @@ def add_power(y, shift, acc):
 
 @nb.njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz", "nnan"})
 def row_peak(acc, guard):
-    """(peak, its index, mean of the cells further than ``guard`` from it, circularly)."""
+    """(peak, its index, mean and standard deviation of the cells further than ``guard`` from it, circularly)."""
     n = len(acc)
-    total, peak = np.float32(0), np.float32(0)
+    total, square, peak = np.float32(0), np.float32(0), np.float32(0)
     for i in range(n):
         total += acc[i]
+        square += acc[i] * acc[i]
         peak = max(peak, acc[i])
     at = 0
     while acc[at] != peak:
         at += 1
-    near = np.float64(0)
+    near, near_square = 0.0, 0.0
     for i in range(at - guard, at + guard + 1):
         near += acc[i % n]
-    return peak, at, (np.float64(total) - near) / (n - 2 * guard - 1)
+        near_square += acc[i % n] * acc[i % n]
+    count = n - 2 * guard - 1
+    mean = (total - near) / count
+    return peak, at, mean, np.sqrt(max((square - near_square) / count - mean * mean, 0.0))
 
 
 @nb.njit(cache=True, nogil=True)
@@ -106,3 +110,36 @@ def piece_sums(x, table, samples_per_chip, length, phase_chips, chips_per_sample
             re += c * x[0, lo + k]
             im += c * x[1, lo + k]
         out[p] = complex(re, im)
+
+
+@nb.njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"})
+def subtract_code(x, table, samples_per_chip, length, phase_chips, chips_per_sample, edges):
+    """x -= a_j code between consecutive ``edges`` (samples), a_j = sum x code / sum code^2 there.
+
+    x planar float32 (2, n) at zero Doppler, in place; code read in blocks of at most 1024 samples.
+    """
+    n_phase = table.shape[0]
+    for j in range(len(edges) - 1):
+        lo, hi = int(edges[j] + 0.5), int(edges[j + 1] + 0.5)
+        re, im, energy = 0.0, 0.0, 0.0
+        for write in range(2):
+            for start in range(lo, hi, 1024):
+                phase = (phase_chips + start * chips_per_sample) % length
+                q = int(phase * samples_per_chip * n_phase + 0.5)
+                row = table[q % n_phase]
+                column = q // n_phase
+                a, b = np.float32(re), np.float32(im)
+                s, t, e = np.float32(0), np.float32(0), np.float32(0)
+                for k in range(min(1024, hi - start)):
+                    c = np.float32(row[column + k])
+                    if write:
+                        x[0, start + k] -= a * c
+                        x[1, start + k] -= b * c
+                    else:
+                        s += c * x[0, start + k]
+                        t += c * x[1, start + k]
+                        e += c * c
+                if not write:
+                    re, im, energy = re + s, im + t, energy + e
+            if energy > 0:
+                re, im, energy = re / energy, im / energy, 0.0
