@@ -9,6 +9,7 @@ runs from 0 to 1; a block belongs to the cell that holds its middle.
 import numpy as np
 from llvmlite import ir
 from numba import njit, types
+from numba.core import cgutils
 from numba.extending import intrinsic
 
 from signals.modulation import BLOCK
@@ -24,6 +25,7 @@ __all__ = [
 ]
 
 SUB = 256
+LOCALITY = 1
 """Samples that share one rotation of the carrier base table."""
 
 COMPONENT = np.dtype(
@@ -80,6 +82,23 @@ def _mix(typingctx, x, key, shift, factor):
         return b.mul(b.xor(y, b.lshr(y, shift)), factor)
 
     return types.uint32(types.uint32, types.uint32, types.uint32, types.uint32), codegen
+
+
+@intrinsic
+def _prefetch(typingctx, array, index):
+    """Hint that ``array[index]`` will be read."""
+
+    def codegen(ctx, b, sig, args):
+        data = ctx.make_array(sig.args[0])(ctx, b, args[0]).data
+        pointer = b.bitcast(b.gep(data, [args[1]]), ir.IntType(8).as_pointer())
+        i32 = ir.IntType(32)
+        signature = ir.FunctionType(ir.VoidType(), [pointer.type, i32, i32, i32])
+        name = "llvm.prefetch.p0" if str(pointer.type) == "ptr" else "llvm.prefetch.p0i8"
+        function = cgutils.get_or_insert_function(b.module, signature, name)
+        b.call(function, [pointer, i32(0), i32(LOCALITY), i32(1)])
+        return ctx.get_dummy_value()
+
+    return types.void(array, index), codegen
 
 
 @njit(cache=True, nogil=True)
@@ -157,55 +176,68 @@ def _carrier_bases(base, carrier, n_cell):
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST)
-def _rotations(rot, carrier, amplitude, n_start, n_cell):
-    """amplitude exp(j carrier phase) in the middle of every sub-block -> ``rot`` (C, 2, sub-blocks)."""
+def _rotations(rot_i, rot_q, carrier, amplitude, n_start, n_cell):
+    """amplitude exp(j carrier phase) in the middle of every sub-block, component after component."""
+    n_sub = len(rot_i) // max(len(carrier), 1)
     for c in range(len(carrier)):
         p0, p1, p2, p3 = carrier[c, 0], carrier[c, 1], carrier[c, 2], carrier[c, 3]
         a0, a1 = amplitude[c, 0], amplitude[c, 1]
-        for j in range(rot.shape[2]):
+        for j in range(n_sub):
             x = (n_start + SUB // 2 + SUB * j) / n_cell
             re, im = _cis(p0 + x * (p1 + x * (p2 + x * p3)))
-            rot[c, 0, j] = _F((a0 + x * a1) * re)
-            rot[c, 1, j] = _F((a0 + x * a1) * im)
+            rot_i[c * n_sub + j] = _F((a0 + x * a1) * re)
+            rot_q[c * n_sub + j] = _F((a0 + x * a1) * im)
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST)
-def _add_one(out_i, out_q, base, at_base, codes, at, start, re, im):
-    """out[start + k] += (re + j im) base[k] code[k], k < SUB."""
-    p, b, c = _Q(start), _Q(at_base), _Q(at)
-    for kk in range(SUB):
-        k = _Q(kk)
-        chip = _F(codes[c + k])
-        x = base[b + k]
-        y = base[b + k + _Q(SUB)]
-        out_i[p + k] += chip * (re * x - im * y)
-        out_q[p + k] += chip * (re * y + im * x)
+def _add_one(out_i, out_q, base, at_base, codes, at, roll, rot_i, rot_q, at_rot, w, next_w):
+    """out += w rot base code over a block; from the first sub-block that starts at or after ``roll`` on, next_w."""
+    b = _Q(at_base)
+    for sub in range(BLOCK // SUB):
+        p, r = _Q(sub * SUB), _Q(at_rot + sub)
+        c = _Q(at) + p
+        u = w if sub * SUB < roll else next_w
+        re, im = rot_i[r] * u, rot_q[r] * u
+        for kk in range(SUB):
+            k = _Q(kk)
+            chip = _F(codes[c + k])
+            x = base[b + k]
+            y = base[b + k + _Q(SUB)]
+            out_i[p + k] += chip * (re * x - im * y)
+            out_q[p + k] += chip * (re * y + im * x)
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST)
-def _add_two(out_i, out_q, base, at_base, codes, at1, at2, start, re, im, w1, w2):
+def _add_two(
+    out_i, out_q, base, at_base, codes, at1, at2, roll, rot_i, rot_q, at_rot, w1, w2, next_w1, next_w2
+):
     """The same for two codes under one carrier."""
-    p, b, c, d = _Q(start), _Q(at_base), _Q(at1), _Q(at2)
-    for kk in range(SUB):
-        k = _Q(kk)
-        chip = w1 * _F(codes[c + k]) + w2 * _F(codes[d + k])
-        x = base[b + k]
-        y = base[b + k + _Q(SUB)]
-        out_i[p + k] += chip * (re * x - im * y)
-        out_q[p + k] += chip * (re * y + im * x)
+    b = _Q(at_base)
+    for sub in range(BLOCK // SUB):
+        p, r = _Q(sub * SUB), _Q(at_rot + sub)
+        c, d = _Q(at1) + p, _Q(at2) + p
+        u1, u2 = (w1, w2) if sub * SUB < roll else (next_w1, next_w2)
+        re, im = rot_i[r], rot_q[r]
+        for kk in range(SUB):
+            k = _Q(kk)
+            chip = u1 * _F(codes[c + k]) + u2 * _F(codes[d + k])
+            x = base[b + k]
+            y = base[b + k + _Q(SUB)]
+            out_i[p + k] += chip * (re * x - im * y)
+            out_q[p + k] += chip * (re * y + im * x)
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST)
-def _add_rest(out_i, out_q, base, at_base, codes, at1, at2, start, first, re, im, w1, w2):
-    """The same from k = ``first`` on: what a symbol that changes inside the sub-block adds to its predecessor."""
-    for k in range(first, SUB):
+def _add_rest(out_i, out_q, base, at_base, codes, at1, at2, roll, re, im, w1, w2):
+    """The same from ``roll`` to the end of its sub-block: what a symbol that changes there adds to its predecessor."""
+    for k in range(roll, (roll // SUB + 1) * SUB):
         chip = w1 * _F(codes[at1 + k])
         if w2 != 0:
             chip += w2 * _F(codes[at2 + k])
-        x = base[at_base + k]
-        y = base[at_base + k + SUB]
-        out_i[start + k] += chip * (re * x - im * y)
-        out_q[start + k] += chip * (re * y + im * x)
+        x = base[at_base + k % SUB]
+        y = base[at_base + SUB + k % SUB]
+        out_i[k] += chip * (re * x - im * y)
+        out_q[k] += chip * (re * y + im * x)
 
 
 @njit(cache=True, nogil=True)
@@ -241,34 +273,58 @@ def _place(comp, code, period, x):
     return period + np.int64(turns), row * comp.n_cols + column, np.int64(roll)
 
 
+@njit(cache=True, nogil=True)
+def _plan(where, weight, components, code, period, symbols, n_start, n_cell):
+    """What every block needs of every component: table indices and roll-over; weights before and after it."""
+    for c in range(len(components)):
+        comp = components[c]
+        for b in range(where.shape[0]):
+            x = (n_start + b * BLOCK + BLOCK // 2) / n_cell
+            n, at, roll = _place(comp, code[c], period[c], x)
+            where[b, c, 0], where[b, c, 1] = comp.code1 + at, comp.code2 + at if comp.code2 >= 0 else -1
+            where[b, c, 2] = roll
+            weight[b, c, 0] = weight[b, c, 2] = _symbol1(comp, symbols, n)
+            weight[b, c, 1] = weight[b, c, 3] = _symbol2(comp, symbols, n)
+            if roll < BLOCK:
+                weight[b, c, 2], weight[b, c, 3] = (
+                    _symbol1(comp, symbols, n + 1),
+                    _symbol2(comp, symbols, n + 1),
+                )
+
+
+@njit(cache=True, nogil=True)
+def _fetch_ahead(where, b, codes):
+    """Ask for the code rows of a block while the one before it is worked on: rows change with the code Doppler."""
+    for c in range(where.shape[1]):
+        for k in range(2):
+            if where[b, c, k] >= 0:
+                for line in range(0, BLOCK, 64):
+                    _prefetch(codes, where[b, c, k] + line)
+
+
 @njit(cache=True, nogil=True, fastmath=_FAST)
-def _add_component(out_i, out_q, comp, c, base, rot, j, code, period, codes, symbols, x):
-    """Add one component to the block with its middle at ``x`` and its first rotation at ``rot[c, :, j]``."""
-    n, at, roll = _place(comp, code[c], period[c], x)
-    w1, w2 = _symbol1(comp, symbols, n), _symbol2(comp, symbols, n)
-    next1, next2 = w1, w2
-    if roll < BLOCK:
-        next1, next2 = _symbol1(comp, symbols, n + 1), _symbol2(comp, symbols, n + 1)
-    at1, at2, at_base = comp.code1 + at, comp.code2 + at, 2 * SUB * c
-    for start in range(0, BLOCK, SUB):
-        re, im = rot[c, 0, j + start // SUB], rot[c, 1, j + start // SUB]
-        if roll <= start:
-            w1, w2 = next1, next2
-        if comp.code2 < 0:
-            _add_one(out_i, out_q, base, at_base, codes, at1 + start, start, re * w1, im * w1)
+def _add_block(out_i, out_q, b, base, rot_i, rot_q, where, weight, codes):
+    """Add every component to block ``b`` of the call."""
+    n_components, n_sub = where.shape[1], where.shape[0] * (BLOCK // SUB)
+    for c in range(n_components):
+        at1, at2, roll = where[b, c, 0], where[b, c, 1], where[b, c, 2]
+        w1, w2, next1, next2 = weight[b, c, 0], weight[b, c, 1], weight[b, c, 2], weight[b, c, 3]
+        at_base, at_rot = 2 * SUB * c, n_sub * c + b * (BLOCK // SUB)
+        if at2 < 0:
+            _add_one(out_i, out_q, base, at_base, codes, at1, roll, rot_i, rot_q, at_rot, w1, next1)
         else:
-            _add_two(out_i, out_q, base, at_base, codes, at1 + start, at2 + start, start, re, im, w1, w2)
-        if start < roll < start + SUB and (next1 != w1 or next2 != w2):
-            d1, d2, cut = next1 - w1, next2 - w2, roll - start
-            _add_rest(
-                out_i, out_q, base, at_base, codes, at1 + start, at2 + start, start, cut, re, im, d1, d2
+            _add_two(
+                out_i, out_q, base, at_base, codes, at1, at2, roll, rot_i, rot_q, at_rot, w1, w2, next1, next2
             )
+        if roll < BLOCK and roll % SUB > 0 and (next1 != w1 or next2 != w2):
+            re, im = rot_i[at_rot + roll // SUB], rot_q[at_rot + roll // SUB]
+            _add_rest(out_i, out_q, base, at_base, codes, at1, at2, roll, re, im, next1 - w1, next2 - w2)
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST)
 def _round(x, gain, limit):
-    """round(gain x), clipped to +-limit; adding 1.5 x 2^23 leaves the integer in the low bits of the float."""
-    return _I(_bits(min(max(gain * x, -limit), limit) + _F(12582912)) - _I(0x4B400000))
+    """round(gain x), clipped to +-limit, in the low 16 bits: adding 1.5 x 2^23 shifts the integer there."""
+    return _bits(min(max(gain * x, -limit), limit) + _F(12582912))
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST)
@@ -332,17 +388,20 @@ def synthesise(
     """
     n_blocks = out.shape[1] // BLOCK
     base = np.empty(len(components) * 2 * SUB, np.float32)
-    rot = np.empty((len(components), 2, n_blocks * (BLOCK // SUB)), np.float32)
+    rot_i = np.empty(len(components) * n_blocks * (BLOCK // SUB), np.float32)
+    rot_q = np.empty_like(rot_i)
     _carrier_bases(base, carrier, n_cell)
-    _rotations(rot, carrier, amplitude, n_start, n_cell)
+    _rotations(rot_i, rot_q, carrier, amplitude, n_start, n_cell)
+    where = np.empty((n_blocks, len(components), 3), np.int64)
+    weight = np.empty((n_blocks, len(components), 4), np.float32)
+    _plan(where, weight, components, code, period, symbols, n_start, n_cell)
     buf_i, buf_q = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
     hash1, hash2 = np.empty(BLOCK, np.uint32), np.empty(BLOCK, np.int32)
     for b in range(n_blocks):
         noise_block(buf_i, buf_q, hash1, hash2, seed, _Q(n_first // BLOCK + b), sigma)
-        x = (n_start + b * BLOCK + BLOCK // 2) / n_cell
-        for c in range(len(components)):
-            comp, j = components[c], b * (BLOCK // SUB)
-            _add_component(buf_i, buf_q, comp, c, base, rot, j, code, period, codes, symbols, x)
+        if b + 1 < n_blocks:
+            _fetch_ahead(where, b + 1, codes)
+        _add_block(buf_i, buf_q, b, base, rot_i, rot_q, where, weight, codes)
         for k in range(BLOCK):
             out[0, _Q(b * BLOCK + k)] = buf_i[k]
         for k in range(BLOCK):
@@ -369,15 +428,18 @@ def synthesise_int8(
     """``synthesise`` and ``quantise_int8`` in one pass through the first-level cache; the same bits."""
     n_blocks = out.shape[1] // BLOCK
     base = np.empty(len(components) * 2 * SUB, np.float32)
-    rot = np.empty((len(components), 2, n_blocks * (BLOCK // SUB)), np.float32)
+    rot_i = np.empty(len(components) * n_blocks * (BLOCK // SUB), np.float32)
+    rot_q = np.empty_like(rot_i)
     _carrier_bases(base, carrier, n_cell)
-    _rotations(rot, carrier, amplitude, n_start, n_cell)
+    _rotations(rot_i, rot_q, carrier, amplitude, n_start, n_cell)
+    where = np.empty((n_blocks, len(components), 3), np.int64)
+    weight = np.empty((n_blocks, len(components), 4), np.float32)
+    _plan(where, weight, components, code, period, symbols, n_start, n_cell)
     buf_i, buf_q = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
     hash1, hash2 = np.empty(BLOCK, np.uint32), np.empty(BLOCK, np.int32)
     for b in range(n_blocks):
         noise_block(buf_i, buf_q, hash1, hash2, seed, _Q(n_first // BLOCK + b), sigma)
-        x = (n_start + b * BLOCK + BLOCK // 2) / n_cell
-        for c in range(len(components)):
-            comp, j = components[c], b * (BLOCK // SUB)
-            _add_component(buf_i, buf_q, comp, c, base, rot, j, code, period, codes, symbols, x)
+        if b + 1 < n_blocks:
+            _fetch_ahead(where, b + 1, codes)
+        _add_block(buf_i, buf_q, b, base, rot_i, rot_q, where, weight, codes)
         _quantise_block(buf_i, buf_q, out, b * BLOCK, gain)

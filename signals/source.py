@@ -83,6 +83,10 @@ class SyntheticSource:
             raise ValueError(
                 f"duration_s = {duration_s:g} holds no sample at fs_hz = {self.fs_hz:g}: make it longer"
             )
+        self._fs = Fraction(self.fs_hz)
+        self._n_cells = math.ceil(Fraction(self.n_samples) * CELLS_PER_S / self._fs)
+        while self._first_block(self._n_cells) * BLOCK < self.n_samples:
+            self._n_cells += 1  # the last block has its middle in the next cell
         self.jammers = tuple(jammers)
         seed = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
         self._seed = seed.generate_state(1, np.uint64)[0]
@@ -94,6 +98,7 @@ class SyntheticSource:
         self._ahead = 2 * threads if threads > 1 else 1
         self._pending: deque[Future | tuple] = deque()
         self._next_cell = 0
+        self._group = (-1, *[np.zeros(0)] * 3)
         self._cell = np.zeros((2, 0), front_end.dtype)
         self._used = 0
         self._position = 0
@@ -143,9 +148,7 @@ class SyntheticSource:
         return math.sqrt(1.0 + power.sum(axis=0).mean() + jamming)
 
     def _pop(self) -> np.ndarray:
-        while (
-            len(self._pending) < self._ahead and self._first_block(self._next_cell) * BLOCK < self.n_samples
-        ):
+        while len(self._pending) < self._ahead and self._next_cell < self._n_cells:
             job = self._prepare(self._next_cell)
             self._pending.append(job if self._pool is None else self._pool.submit(self._make, *job))
             self._next_cell += 1
@@ -153,40 +156,45 @@ class SyntheticSource:
         return self._make(*head) if isinstance(head, tuple) else head.result()
 
     def _first_block(self, cell: int) -> int:
-        """First block with its middle at or after the beginning of the cell."""
-        return max(math.ceil(Fraction(self.fs_hz) * cell / (CELLS_PER_S * BLOCK) - Fraction(1, 2)), 0)
+        """First block with its middle at or after the beginning of the cell, in exact arithmetic."""
+        num, den = self._fs.as_integer_ratio()
+        unit = CELLS_PER_S * BLOCK * den
+        return max(-((unit - 2 * num * cell) // (2 * unit)), 0)
 
     def _prepare(self, cell: int) -> tuple:
         """All that the kernel needs for one cell; what is slow and what is shared is done here, in order."""
-        first, last = self._first_block(cell), self._first_block(cell + 1)
-        code, carrier, gain = self._polynomials(cell)
-        symbols, components = self._symbols(cell // (CELLS_PER_S * _SEGMENT_S))
+        group, k = divmod(cell, CELLS_PER_S)
+        if self._group[0] != group:
+            self._group = (group, *self._polynomials(group * CELLS_PER_S))
+        _, code, carrier, gain = self._group
+        symbols, components = self._symbols(group // _SEGMENT_S)
         periods = np.round(cell * _CELL_CHIPS / components["code_length_chips"]).astype(np.int64)
-        n_start = float(first * BLOCK - Fraction(self.fs_hz) * cell / CELLS_PER_S)
-        keep = np.flatnonzero(gain.any(axis=1))
-        return (
-            first,
-            last,
-            n_start,
-            components[keep],
-            code[keep],
-            carrier[keep],
-            gain[keep],
-            periods[keep],
-            symbols,
-        )
+        first, last = self._first_block(cell), self._first_block(cell + 1)
+        num, den = self._fs.as_integer_ratio()
+        n_start = (first * BLOCK * CELLS_PER_S * den - num * cell) / (CELLS_PER_S * den)
+        job = components, code[k], carrier[k], gain[k], periods
+        seen = gain[k].any(axis=1)
+        if not seen.all():
+            job = tuple(part[seen] for part in job)
+        return first, last, n_start, *job, symbols
 
     def _polynomials(self, cell: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Cubics through delays and rates at both ends of the cell: code chips, carrier cycles; amplitude line."""
-        sky = self.sky.propagate(np.array([cell, cell + 1]) / CELLS_PER_S)
+        """Code chips (cells, S, 4), carrier cycles, amplitude (cells, S, 2) of the cells of a second.
+
+        Cubics through delays and rates at both ends of a cell; the amplitude is a line.
+        """
+        cells = np.arange(cell, min(cell + CELLS_PER_S, self._n_cells))
+        sky = self.sky.propagate(np.append(cells, cells[-1] + 1) / CELLS_PER_S)
         code = -CHIP_RATE_HZ * _hermite(sky.delay_s, sky.delay_rate_s_s)
-        code[:, 1] += _CELL_CHIPS
+        code[..., 1] += _CELL_CHIPS
         carrier = -F_L1_HZ * _hermite(sky.phase_delay_s, sky.phase_delay_rate_s_s)
-        carrier[:, 0] += math.fmod(cell * math.fmod(self.if_hz / CELLS_PER_S, 1.0), 1.0)
-        carrier[:, 0] -= np.floor(carrier[:, 0])
-        carrier[:, 1] += self.if_hz / CELLS_PER_S
-        ends = amplitude(sky.cn0_dbhz, self.fs_hz, self.complex) * sky.visible.all(axis=1, keepdims=True)
-        return code, carrier, np.column_stack([ends[:, 0], ends[:, 1] - ends[:, 0]])
+        carrier[..., 0] += np.mod(cells * math.fmod(self.if_hz / CELLS_PER_S, 1.0), 1.0)[:, None]
+        carrier[..., 0] -= np.floor(carrier[..., 0])
+        carrier[..., 1] += self.if_hz / CELLS_PER_S
+        ends = amplitude(sky.cn0_dbhz, self.fs_hz, self.complex).T
+        seen = (sky.visible[:, :-1] & sky.visible[:, 1:]).T
+        gain = np.stack([ends[:-1], ends[1:] - ends[:-1]], axis=-1) * seen[..., None]
+        return code, carrier, gain
 
     def _symbols(self, segment: int) -> tuple[np.ndarray, np.ndarray]:
         """Flat symbols of a segment and the components that point into them."""
@@ -224,11 +232,11 @@ class SyntheticSource:
 
 
 def _hermite(value: np.ndarray, rate: np.ndarray) -> np.ndarray:
-    """Coefficients (S, 4) in x of the cubic with these values and rates (per second) at both ends of a cell."""
-    v0, v1 = value[:, 0], value[:, 1]
-    d0, d1 = rate[:, 0] / CELLS_PER_S, rate[:, 1] / CELLS_PER_S
+    """Cubics in x with the values and rates (per second) of (S, cells + 1) nodes -> (cells, S, 4)."""
+    v0, v1 = value.T[:-1], value.T[1:]
+    d0, d1 = rate.T[:-1] / CELLS_PER_S, rate.T[1:] / CELLS_PER_S
     rise = v1 - v0
-    return np.column_stack([v0, d0, 3.0 * rise - 2.0 * d0 - d1, d0 + d1 - 2.0 * rise])
+    return np.stack([v0, d0, 3.0 * rise - 2.0 * d0 - d1, d0 + d1 - 2.0 * rise], axis=-1)
 
 
 def _signals_of(satellite: Satellite) -> tuple[str, ...]:
