@@ -21,12 +21,30 @@ from signals.timescale import calendar, week_tow
 
 MAX_FILE_BYTES = 32 << 20
 MAX_RECORDS = 30_000
-_MAX_GRID_BYTES = 1 << 30
+_MAX_GRID_BYTES = 64 << 20
 _MAX_AGE_S = {"G": 7_200.0, "E": 10_800.0}
 _ZERO = " 0.000000000000E+00"
 
 URA_M = (2.0, 2.8, 4.0, 5.7, 8.0, 11.3, 16.0, 32.0, 64.0, 128.0, 256.0, 512.0, 1024.0, 2048.0, 4096.0, 8192.0)
 """Nominal accuracy of the GPS URA indices 0..15 (IS-GPS-200, 20.3.3.3.1.3)."""
+URA_LIMIT_M = (
+    2.4,
+    3.4,
+    4.85,
+    6.85,
+    9.65,
+    13.65,
+    24.0,
+    48.0,
+    96.0,
+    192.0,
+    384.0,
+    768.0,
+    1536.0,
+    3072.0,
+    6144.0,
+)
+"""Upper limits of the indices 0..14; files hold either these or the nominal values."""
 SISA_M = np.concatenate(
     [np.arange(50) * 0.01, 0.5 + np.arange(25) * 0.02, 1.0 + np.arange(25) * 0.04, 2.0 + np.arange(26) * 0.16]
 )
@@ -110,7 +128,7 @@ def select(ephemerides: np.ndarray, system: str, prn: int, week: int, tow_s: flo
 
 def accuracy_index(system: str, metres: float) -> int:
     """Message index of an accuracy: the smallest that covers it; 15 (GPS), 255 (Galileo) if none."""
-    table = URA_M[:15] if system == "G" else SISA_M
+    table = URA_LIMIT_M if system == "G" else SISA_M
     none = 15 if system == "G" else 255
     fits = np.flatnonzero(np.asarray(table) >= metres - 1e-6)
     return int(fits[0]) if fits.size and metres >= 0.0 else none
@@ -195,7 +213,7 @@ def _georinex(path, version: int, kind: str, records: list[list[str]]):
     text = [f"{version:6d}.00".ljust(20) + kind.ljust(20) + "M".ljust(20) + "RINEX VERSION / TYPE"]
     text.append(" " * 60 + "END OF HEADER")
     for record in last.values():
-        text += _complete(record, 4 if version == 3 else 3)
+        text += _complete(path, record, 4 if version == 3 else 3)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", FutureWarning)
@@ -216,14 +234,22 @@ def _check_grid(path, version: int, records: list[list[str]]) -> None:
         )
 
 
-def _complete(record: list[str], indent: int) -> list[str]:
-    """The eight lines with every blank field of 19 columns written as zero, and D exponents as E."""
+def _complete(path, record: list[str], indent: int) -> list[str]:
+    """The eight lines with every blank field of 19 columns written as zero, and D exponents as E.
+
+    A field that is no number is refused here: georinex would drop its record without a word.
+    """
     out = []
     for row, line in enumerate(record):
         start = indent if row else indent + 19
         cells = [line[start + 19 * i : start + 19 * (i + 1)] for i in range(4 if row else 3)]
-        done = "".join(cell.rjust(19) if cell.strip() else _ZERO for cell in cells)
-        out.append(line[:start].ljust(start) + done.replace("D", "E").replace("d", "E"))
+        cells = [re.sub("[Dd]", "E", cell).rjust(19) if cell.strip() else _ZERO for cell in cells]
+        for cell in cells:
+            if not re.fullmatch(r"\s*[-+]?\d*\.?\d+\.?(E[-+]?\d{1,3})?\s*", cell):
+                raise ValueError(
+                    f"RINEX file {path}: record {record[0][:23]!r} holds {cell!r}, which is no number"
+                )
+        out.append(line[:start].ljust(start) + "".join(cells))
     return out
 
 

@@ -9,7 +9,9 @@ ALPHA, BETA = (0.382e-7, 0.149e-7, -0.179e-6, 0.0), (0.143e6, 0.0, -0.328e6, 0.1
 
 def test_published_example():
     # Worked example that circulates with the Klobuchar model: 40 N, 100 W, azimuth 210, elevation 20: 23.784 m.
-    delay = klobuchar(np.radians(40), np.radians(-100), np.radians(210), np.radians(20), 593_100.0, ALPHA, BETA)
+    delay = klobuchar(
+        np.radians(40), np.radians(-100), np.radians(210), np.radians(20), 593_100.0, ALPHA, BETA
+    )
     assert abs(delay * naive.C - 23.784) < 5e-4
 
 

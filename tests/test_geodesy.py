@@ -49,4 +49,6 @@ def test_scalar_kernel_is_the_same_function():
     pos = geodetic_to_ecef(LAT, LON, HEIGHT)
     other = np.array([geodetic_kernel(*p) for p in pos])
     lat, lon, height = ecef_to_geodetic(pos)
-    assert np.abs(np.stack([lat * 6.4e6, lon * 6.4e6, height], axis=1) - other * [6.4e6, 6.4e6, 1]).max() < TOL_M
+    assert (
+        np.abs(np.stack([lat * 6.4e6, lon * 6.4e6, height], axis=1) - other * [6.4e6, 6.4e6, 1]).max() < TOL_M
+    )

@@ -137,7 +137,12 @@ def test_default_iono_utc_passes_both_messages_unchanged():
 
 @pytest.mark.parametrize(
     "field, value, word",
-    [("e", 0.5, "eccentricity"), ("sqrt_a_sqrt_m", 100.0, "sqrt"), ("m0_rad", np.nan, "number"), ("toe_s", 7e5, "toe")],
+    [
+        ("e", 0.5, "eccentricity"),
+        ("sqrt_a_sqrt_m", 100.0, "sqrt"),
+        ("m0_rad", np.nan, "number"),
+        ("toe_s", 7e5, "toe"),
+    ],
 )
 def test_impossible_elements_are_refused_by_name(field, value, word):
     eph = BOTH[4].copy()
