@@ -366,84 +366,126 @@ def _peak_offset(left, mid, right):
 
 
 @njit(nogil=True)
-def _search_ca(hist, energy):
-    """Joint search over frequency (+-250 Hz) and bit edge: energies of 9 sums of 20 ms, summed.
+def _turn_back(hist, n, dt, f, r, out):
+    """hist[k] exp(-2 pi i (f t + r t^2 / 2)), t = (k + 1/2) dt from the middle of the n values."""
+    dc, ds = 1.0, 0.0
+    t = (0.5 - 0.5 * n) * dt
+    w = _TWO_PI * (f * t + 0.5 * r * t * t)
+    c, s = math.cos(w), math.sin(w)
+    w = _TWO_PI * ((f + r * t) * dt + 0.5 * r * dt * dt)
+    dc, ds = math.cos(w), math.sin(w)
+    w = _TWO_PI * r * dt * dt
+    ec, es = math.cos(w), math.sin(w)
+    for k in range(n):
+        out[k, 0] = hist[k, 0] * c + hist[k, 1] * s
+        out[k, 1] = hist[k, 1] * c - hist[k, 0] * s
+        c, s = c * dc - s * ds, c * ds + s * dc
+        dc, ds = dc * ec - ds * es, dc * es + ds * ec
 
-    hist: (200, 2) prompts of 1 ms with a fixed NCO. ``energy`` (20,): per bit edge at the best frequency.
-    Returns (frequency error, best energy).
-    """
-    step, half = 10.0, 25
-    prefix = np.empty((HISTORY + 1, 2))
-    table = np.empty((2 * half + 1, 20))
-    best, fb, eb = -1.0, 0, 0
-    for f in range(2 * half + 1):
-        w = _TWO_PI * (f - half) * step * 1e-3
-        dc, ds = math.cos(w), math.sin(w)
-        c, s = 1.0, 0.0
-        prefix[0, 0] = prefix[0, 1] = 0.0
-        for k in range(HISTORY):
-            prefix[k + 1, 0] = prefix[k, 0] + hist[k, 0] * c + hist[k, 1] * s
-            prefix[k + 1, 1] = prefix[k, 1] + hist[k, 1] * c - hist[k, 0] * s
-            c, s = c * dc - s * ds, c * ds + s * dc
-        for e in range(20):
-            total = 0.0
-            for m in range(9):
-                k = e + 20 * m
-                re, im = prefix[k + 20, 0] - prefix[k, 0], prefix[k + 20, 1] - prefix[k, 1]
-                total += re * re + im * im
-            table[f, e] = total
-            if total > best:
-                best, fb, eb = total, f, e
+
+@njit(nogil=True)
+def _bit_energies(z, energy):
+    """Energy of 9 sums of 20 prompts for each of 20 bit edges; returns the largest and its edge."""
+    best, edge = -1.0, 0
     for e in range(20):
-        energy[e] = table[fb, e]
-    offset = 0.0
-    if 0 < fb < 2 * half:
-        offset = _peak_offset(table[fb - 1, eb], best, table[fb + 1, eb])
-    return (fb - half + offset) * step, best
+        total = 0.0
+        for m in range(9):
+            re = im = 0.0
+            for k in range(e + 20 * m, e + 20 * m + 20):
+                re += z[k, 0]
+                im += z[k, 1]
+            total += re * re + im * im
+        energy[e] = total
+        if total > best:
+            best, edge = total, e
+    return best, edge
+
+
+@njit(nogil=True)
+def _search_ca(hist, noise, energy):
+    """Joint search over frequency (+-250 Hz), its rate (+-600 Hz/s) and bit edge: energies of 9 sums of 20 ms.
+
+    hist: (200, 2) prompts of 1 ms with a fixed NCO. A rate is believed only where it brings more energy than noise
+    would (20 times the noise of one sum). ``energy`` (20,): per bit edge at the best frequency. Returns (frequency error
+    at the end of the history, rate, best energy).
+    """
+    step, dt = 10.0, 1e-3
+    z, trial = np.empty((HISTORY, 2)), np.empty(20)
+    best, f0 = -1.0, 0.0
+    for k in range(-25, 26):
+        _turn_back(hist, HISTORY, dt, k * step, 0.0, z)
+        total, _ = _bit_energies(z, trial)
+        if total > best:
+            best, f0 = total, k * step
+    still, f, r = best, f0, 0.0
+    for m in range(-10, 11):
+        for k in range(-5, 6):
+            _turn_back(hist, HISTORY, dt, f0 + k * step, 60.0 * m, z)
+            total, _ = _bit_energies(z, trial)
+            if total > best and total > still + 20.0 * 20.0 * noise:
+                best, f, r = total, f0 + k * step, 60.0 * m
+    _turn_back(hist, HISTORY, dt, f, r, z)
+    best, edge = _bit_energies(z, energy)
+    _turn_back(hist, HISTORY, dt, f - step, r, z)
+    _bit_energies(z, trial)
+    left = trial[edge]
+    _turn_back(hist, HISTORY, dt, f + step, r, z)
+    _bit_energies(z, trial)
+    f += step * _peak_offset(left, best, trial[edge])
+    return f + 0.5 * r * HISTORY * dt, r, best
+
+
+@njit(nogil=True)
+def _pilot_energies(z, secondary, energy):
+    """Energy of two sums of 25 periods (pairs of halves) for each of 25 chips of the secondary code."""
+    best, chip = -1.0, 0
+    for shift in range(25):
+        total = 0.0
+        for m in range(2):
+            re = im = 0.0
+            for k in range(25):
+                sign = secondary[(shift + k) % 25]
+                j = 50 * m + 2 * k
+                re += sign * (z[j, 0] + z[j + 1, 0])
+                im += sign * (z[j, 1] + z[j + 1, 1])
+            total += re * re + im * im
+        energy[shift] = total
+        if total > best:
+            best, chip = total, shift
+    return best, chip
 
 
 @njit(nogil=True)
 def _search_pilot(hist, secondary):
-    """Joint search over frequency (+-200 Hz) and secondary-code phase: energies of 2 sums of 25 periods.
+    """Joint search over frequency, its rate (+-300 Hz/s) and secondary-code phase: energies of 2 sums of 25 periods.
 
-    hist: (100, 2) prompts of 2 ms (halves of a period). Returns (frequency error, chip at the first period,
-    best energy, best energy of any other chip).
+    hist: (100, 2) prompts of 2 ms (halves of a period). The phase between the halves gives the frequency within
+    +-50 Hz first. Returns (frequency error at the end, rate, chip at the first period, best energy, best energy of
+    any other chip).
     """
-    step, half = 2.5, 80
-    z = np.empty((50, 2))
-    table = np.empty((2 * half + 1, 25))
-    best, fb, sb = -1.0, 0, 0
-    for f in range(2 * half + 1):
-        w = _TWO_PI * (f - half) * step * 2e-3
-        dc, ds = math.cos(w), math.sin(w)
-        c, s = 1.0, 0.0
-        for k in range(100):
-            if k & 1 == 0:
-                z[k >> 1, 0] = z[k >> 1, 1] = 0.0
-            z[k >> 1, 0] += hist[k, 0] * c + hist[k, 1] * s
-            z[k >> 1, 1] += hist[k, 1] * c - hist[k, 0] * s
-            c, s = c * dc - s * ds, c * ds + s * dc
-        for chip in range(25):
-            total = 0.0
-            for m in range(2):
-                re = im = 0.0
-                for k in range(25):
-                    sign = secondary[(chip + k) % 25]
-                    re += sign * z[25 * m + k, 0]
-                    im += sign * z[25 * m + k, 1]
-                total += re * re + im * im
-            table[f, chip] = total
+    step, dt, n = 2.5, 2e-3, HISTORY // 2
+    z, trial, energy = np.empty((n, 2)), np.empty(25), np.zeros(25)
+    f0, _ = _search_data(hist)
+    best, f, r, chip = -1.0, 0.0, 0.0, 0
+    for m in range(-10, 11):
+        for k in range(-20, 21):
+            _turn_back(hist, n, dt, f0 + k * step, 30.0 * m, z)
+            total, shift = _pilot_energies(z, secondary, trial)
+            for i in range(25):
+                energy[i] = max(energy[i], trial[i])
             if total > best:
-                best, fb, sb = total, f, chip
+                best, f, r, chip = total, f0 + k * step, 30.0 * m, shift
     second = 0.0
-    for f in range(2 * half + 1):
-        for chip in range(25):
-            if chip != sb:
-                second = max(second, table[f, chip])
-    offset = 0.0
-    if 0 < fb < 2 * half:
-        offset = _peak_offset(table[fb - 1, sb], best, table[fb + 1, sb])
-    return (fb - half + offset) * step, sb, best, second
+    for i in range(25):
+        if i != chip:
+            second = max(second, energy[i])
+    _turn_back(hist, n, dt, f - step, r, z)
+    _pilot_energies(z, secondary, trial)
+    left = trial[chip]
+    _turn_back(hist, n, dt, f + step, r, z)
+    _pilot_energies(z, secondary, trial)
+    f += step * _peak_offset(left, best, trial[chip])
+    return f + 0.5 * r * n * dt, r, chip, best, second
 
 
 @njit(nogil=True)
@@ -476,7 +518,7 @@ def _close_loops(st, sample):
     st.locked_time_s = 0.0
     st.phase_locked = 0
     st.bad_s = 0.0
-    st.rate_hz, st.rate_hz_s, st.code_rate_chips_s = st.doppler_hz, 0.0, 0.0
+    st.code_rate_chips_s = 0.0
     st.symbol_m, st.symbol_n = 0, 0
     st.symbol_i = st.symbol_q = 0.0
     _reset_moments(st)
@@ -490,10 +532,10 @@ def _retry(st, limit):
 
 
 @njit(nogil=True)
-def _set_frequency(st, error_hz):
+def _set_frequency(st, error_hz, rate_hz_s):
     if st.steered == 0:
         st.doppler_hz += error_hz
-        st.rate_hz = st.doppler_hz
+        st.rate_hz, st.rate_hz_s = st.doppler_hz, rate_hz_s
 
 
 @njit(nogil=True)
@@ -509,14 +551,14 @@ def _synchronise(st, hist, secondary, noise):
         return
     if st.kind == KIND_CA:
         energy = np.empty(20)
-        f, best = _search_ca(hist, energy)
+        f, rate, best = _search_ca(hist, noise, energy)
         if best < 4.0 * 180.0 * noise:
             st.state = STATE_PULL_IN
             st.bit_energy[:] = 0.0
             _retry(st, 5)
             return
         st.state = STATE_BIT_SYNC
-        _set_frequency(st, f)
+        _set_frequency(st, f, rate)
         top, second, edge = -1.0, -1.0, 0
         for e in range(20):
             k = (st.hist_period + e) % 20
@@ -535,11 +577,11 @@ def _synchronise(st, hist, secondary, noise):
         else:
             _retry(st, 20)
     elif st.kind == KIND_PILOT:
-        f, chip, best, second = _search_pilot(hist, secondary)
+        f, rate, chip, best, second = _search_pilot(hist, secondary)
         if best < 25.0 * 25.0 * noise or best < 1.5 * second:
             _retry(st, 5)
             return
-        _set_frequency(st, f)
+        _set_frequency(st, f, rate)
         st.symbol_phase = (chip - st.hist_period) % 25
         _close_loops(st, st.next_sample)
     else:
@@ -548,7 +590,7 @@ def _synchronise(st, hist, secondary, noise):
         if magnitude < 4.0 * math.sqrt(50.0) * 2.0 * noise:
             _retry(st, 5)
             return
-        _set_frequency(st, f)
+        _set_frequency(st, f, 0.0)
         st.symbol_phase = 0
         _close_loops(st, st.next_sample)
 
