@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from signals import lnav
 from signals.almanac import elements
-from signals.constants import EARTH_RATE_RAD_S, MU_GPS_M3_S2
+from signals.constants import EARTH_RATE_RAD_S, GNSS_PI, MU_GPS_M3_S2
 from signals.fields import pack
 from signals.records import EPHEMERIS, IONO_UTC
 
@@ -135,6 +135,17 @@ def test_out_of_range_is_refused_by_name(name: str) -> None:
     for raw in (field.limits[1] + 1, field.limits[0] - 1):
         with pytest.raises(ValueError, match=rf"G05: {name} = .*allowed"):
             stream(30, 0, ephemeris(**{name: raw * field.lsb}))
+
+
+def test_angles_come_back_within_half_a_turn() -> None:
+    """Angles are sent modulo one turn (of the ICD's pi), however the record counts them."""
+    decoder = lnav.Decoder(5)
+    decoder.feed(stream(18, 0, ephemeris(m0_rad=3.3, omega0_rad=-9.0, omega_rad=np.pi)), 0)
+    assert decoder.ephemeris is not None
+    turn, lsb = 2 * GNSS_PI, GNSS_PI * 2**-31
+    for name, want in (("m0_rad", 3.3 - turn), ("omega0_rad", -9.0 + turn)):
+        assert abs(decoder.ephemeris[name] - want) <= lsb
+    assert abs(abs(decoder.ephemeris["omega_rad"]) - GNSS_PI) <= lsb
 
 
 def test_other_values_that_cannot_be_sent() -> None:
@@ -379,7 +390,7 @@ def test_iono_utc_and_almanac_over_one_master_frame() -> None:
 
 def test_time_polynomial_keeps_its_value_off_the_grid() -> None:
     sent = iono_utc()
-    sent["tot_s"], sent["a1_utc_s_s"] = 3600.0 * 33, 1e-13
+    sent["tot_s"], sent["a1_utc_s_s"] = 3600.0 * 33, 1e-10
     decoder = lnav.Decoder(5)
     decoder.feed(stream(40, 17 * 30, iono=sent), 0)
     got = decoder.iono_utc
@@ -405,6 +416,8 @@ def test_almanac_describes_the_same_orbit(weeks: int) -> None:
     reduced = elements(record, WEEK + weeks, toa_s)
     n = np.sqrt(MU_GPS_M3_S2) / record["sqrt_a_sqrt_m"] ** 3 + record["delta_n_rad_s"]
     rate = record["omega_dot_rad_s"]
+    age_s = weeks * 604_800 + toa_s - 600_000.0
+    assert abs(reduced["af0_s"] - (record["af0_s"] + record["af1_s_s"] * age_s)) < 1e-15
     for t_s in (0.0, 300_000.0, 650_000.0):  # in the week of the record
         want = node_and_anomaly(record["m0_rad"], record["omega0_rad"], rate, n, 600_000.0, t_s)
         have = node_and_anomaly(
