@@ -36,6 +36,13 @@ MOTIONS = [
     Approach(),
     HighDynamics(acc_ned_mps2=(98.1, 80.0, 50.0)),
     DRIVE,
+    # Fast and steep: the turning of the local axes matters (2500 m/s over the Earth's radius times 900 m/s: 0.4 m/s2).
+    Segments(
+        heading_deg=30.0,
+        speed_mps=2_500.0,
+        climb_mps=900.0,
+        segment=(Segment(duration_s=50.0, turn_rate_deg_s=1.0),),
+    ),
 ]
 
 
