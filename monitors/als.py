@@ -76,7 +76,9 @@ def _basis_term(row_pairs, i, l_rows, out):
 
 
 @njit(cache=True, nogil=True)
-def _accumulate(phi, qd, h, k, var, used, rows, other, pairs, p_start, lags, settle, known_out, column_out, counts):
+def _accumulate(
+    phi, qd, h, k, var, used, rows, other, pairs, p_start, lags, settle, known_out, column_out, counts
+):
     """Propagate all parts through the log and sum the model of lags 0..N-1 over epochs k >= settle.
 
     Parts: 0 = start covariance and rows of known R, 1 = process noise, 2.. = unknown basis matrices.
@@ -277,7 +279,9 @@ def solve(model: AlsModel, sample: np.ndarray, weighted: bool = True) -> AlsResu
     scaled = matrix / norm
     condition = float(np.linalg.cond(scaled))
     if not condition < 1e8:
-        raise ValueError("The ALS equations are singular: the window does not tell the unknown variances apart.")
+        raise ValueError(
+            "The ALS equations are singular: the window does not tell the unknown variances apart."
+        )
     full = any(a != b for a, b in model.basis)
     if full:
         theta = np.linalg.lstsq(scaled, target, rcond=None)[0] / norm
@@ -398,7 +402,12 @@ class AlsRun:
             return None
         self._seen = 0
         spec = self.spec
-        options = {"n_lags": spec.n_lags, "full": spec.full, "settle": spec.settle_epochs, "joint_q": spec.joint_q}
+        options = {
+            "n_lags": spec.n_lags,
+            "full": spec.full,
+            "settle": spec.settle_epochs,
+            "joint_q": spec.joint_q,
+        }
         try:
             self.result = estimate(filt.log(need), self.rows, **options)
         except (ValueError, np.linalg.LinAlgError) as error:

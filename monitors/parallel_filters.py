@@ -257,7 +257,9 @@ def monte_carlo(
                         trace_resid[run, t, c] = resid[f, sut]
                         trace_var[run, t, c] = resid_var[f, sut]
                         # What the declaration saw: restarted filters have nothing left to sum.
-                        trace_chi[run, t, c] = _window_sum(hist[f, sut], age[f], window) if age[f] > 0 else math.nan
+                        trace_chi[run, t, c] = (
+                            _window_sum(hist[f, sut], age[f], window) if age[f] > 0 else math.nan
+                        )
                         c += 1
                 trace_x[run, t] = truth - x[0]
                 for a in range(n):
@@ -300,7 +302,9 @@ class ParallelFilters(BaseModel):
     reset_to: Literal["oldest", "leading"] = "oldest"
     min_satellites: int = Field(3, ge=1, le=64)
     recertify_windows: int = Field(0, ge=0, le=1000)
-    recertify_threshold: float = Field(34.8, gt=0, description="0.99 quantile of chi-square with 18 degrees of freedom")
+    recertify_threshold: float = Field(
+        34.8, gt=0, description="0.99 quantile of chi-square with 18 degrees of freedom"
+    )
     recertify_growth: float = Field(1.5, ge=1)
 
     def layout(self, m: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -314,7 +318,9 @@ class ParallelFilters(BaseModel):
         if self.short_window_epochs > self.window_epochs:
             raise ValueError("short_window_epochs must not exceed window_epochs.")
         if self.window_epochs > self.period_epochs:
-            raise ValueError("window_epochs must not exceed period_epochs: the sums are dropped at every reset.")
+            raise ValueError(
+                "window_epochs must not exceed period_epochs: the sums are dropped at every reset."
+            )
         if m < 2:
             raise ValueError(f"The parallel filters need at least 2 satellites besides other aids, not {m}.")
         count = 1 + m * self.staggered
@@ -328,7 +334,9 @@ class ParallelFilters(BaseModel):
 
     def numbers(self) -> tuple[np.ndarray, np.ndarray]:
         """(limits, ints) as ``bank_step`` takes them."""
-        limits = np.array([self.threshold, self.short_threshold, self.recertify_threshold, self.recertify_growth])
+        limits = np.array(
+            [self.threshold, self.short_threshold, self.recertify_threshold, self.recertify_growth]
+        )
         sets = int(self.scheme == "sets_of_four")
         rule = LEADING if self.reset_to == "leading" else OLDEST
         ints = [self.short_window_epochs, self.recertify_windows, self.min_satellites, sets, rule]
@@ -345,7 +353,9 @@ def _sets_layout(m: int):
         raise ValueError(f"Sets of four need at least 5 satellites, not {m}.")
     sets = list(itertools.combinations(range(m), 4))
     if len(sets) > MAX_SET_FILTERS:
-        raise ValueError(f"{m} satellites make {len(sets)} sets of four, more than {MAX_SET_FILTERS}: use leave_one_out.")
+        raise ValueError(
+            f"{m} satellites make {len(sets)} sets of four, more than {MAX_SET_FILTERS}: use leave_one_out."
+        )
     use = np.zeros((1 + len(sets), m), dtype=np.bool_)
     use[0] = True
     for j, members in enumerate(sets):
@@ -396,12 +406,18 @@ class ParallelBank:
         """The nominal state was corrected by dx = true - estimate: subtract it from every filter's error state."""
         self.x -= dx
 
-    def __call__(self, phi, qd, h, z, var, avail=None, extra_h=None, extra_z=None, extra_var=None) -> BankReport:
+    def __call__(
+        self, phi, qd, h, z, var, avail=None, extra_h=None, extra_z=None, extra_var=None
+    ) -> BankReport:
         """One epoch: predict by (phi, qd), test, update, decide. ``extra_*`` are other aids (barometer, odometer)."""
         m, n = h.shape
         avail = np.ones(m, dtype=np.bool_) if avail is None else np.asarray(avail, dtype=np.bool_)
         none = extra_z is None
-        extra = np.zeros((0, n)) if none else extra_h, np.zeros(0) if none else extra_z, np.zeros(0) if none else extra_var
+        extra = (
+            np.zeros((0, n)) if none else extra_h,
+            np.zeros(0) if none else extra_z,
+            np.zeros(0) if none else extra_var,
+        )
         if not (np.all(var[avail] > 0) and np.all(extra[2] > 0)):
             raise ValueError("The parallel filters need measurement variances above zero.")
         use, test, period, phase = self._layout
@@ -415,8 +431,16 @@ class ParallelBank:
         self.unavailable = None
         if few < self.spec.min_satellites + 1:
             need = self.spec.min_satellites + 1
-            self.unavailable = f"The parallel filters need {need} satellites to exclude one, {few} are in use."
+            self.unavailable = (
+                f"The parallel filters need {need} satellites to exclude one, {few} are in use."
+            )
         fom = np.where(self.excluded, 0, 1)
         return BankReport(
-            int(declared), fom, self._long.copy(), self._short.copy(), self.x[0].copy(), self.p[0].copy(), declared >= 0
+            int(declared),
+            fom,
+            self._long.copy(),
+            self._short.copy(),
+            self.x[0].copy(),
+            self.p[0].copy(),
+            declared >= 0,
         )

@@ -205,15 +205,24 @@ def replay(log: EpochLog, p0, cov_v, runs: int, rng: np.random.Generator, qd_sca
     """
     e_count, m, n = log.h.shape
     root_v = np.diag(np.sqrt(cov_v)) if np.ndim(cov_v) == 1 else np.linalg.cholesky(cov_v)
-    w = rng.standard_normal((e_count, runs, n)) @ (np.sqrt(qd_scale) * _psd_root(log.qd)).transpose(0, 2, 1)
+    w = rng.standard_normal((e_count, runs, n)) @ (np.sqrt(qd_scale) * psd_root(log.qd)).transpose(0, 2, 1)
     v = rng.standard_normal((e_count, runs, m)) @ root_v.T
-    e0 = rng.standard_normal((runs, n)) @ _psd_root(np.asarray(p0)).T if e0 is None else np.ascontiguousarray(e0)
+    e0 = (
+        rng.standard_normal((runs, n)) @ psd_root(np.asarray(p0)).T
+        if e0 is None
+        else np.ascontiguousarray(e0)
+    )
     r, err = np.empty_like(v), np.empty_like(w)
     kernels.replay(e0, log.phi, log.h, log.k, w, v, r, err)
     return r, err
 
 
-def _psd_root(matrix: np.ndarray) -> np.ndarray:
-    """Square root A of a positive semidefinite matrix (stack), A A' = matrix."""
-    lam, vec = np.linalg.eigh(matrix)
-    return vec * np.sqrt(np.clip(lam, 0.0, None))[..., None, :]
+def psd_root(matrix: np.ndarray) -> np.ndarray:
+    """Square root A of a positive semidefinite matrix (stack), A A' = matrix.
+
+    Taken of the correlation matrix: eigenvalues of a matrix that mixes rad^2 with m^2 would lose the small ones.
+    """
+    diag = np.sqrt(np.diagonal(matrix, axis1=-2, axis2=-1))
+    inv = np.where(diag > 0, 1.0 / np.where(diag > 0, diag, 1.0), 0.0)
+    lam, vec = np.linalg.eigh(matrix * inv[..., :, None] * inv[..., None, :])
+    return diag[..., :, None] * vec * np.sqrt(np.clip(lam, 0.0, None))[..., None, :]

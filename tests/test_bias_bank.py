@@ -64,7 +64,9 @@ def test_log_recursion_is_bayes_rule_on_the_parity_vector():
         r = rng.normal(size=7) * np.sqrt(var)
         for i in range(29):
             d = v1 @ r - mu[i] * v1[:, rows[i]]
-            p[i] *= math.exp(-0.5 * d @ np.linalg.solve(gamma, d)) / math.sqrt((2 * math.pi) ** 3 * np.linalg.det(gamma))
+            p[i] *= math.exp(-0.5 * d @ np.linalg.solve(gamma, d)) / math.sqrt(
+                (2 * math.pi) ** 3 * np.linalg.det(gamma)
+            )
         p /= p.sum()
         bb.update_log(log_p, w, r, rows, mu, -1e9)
         bb.update_linear(linear, w, r, rows, mu, bb.log_normaliser(h, var))
@@ -87,7 +89,9 @@ def test_filter_error_does_not_matter():
 def test_rate_law_and_redundancy_numbers():
     """Drift of the log odds of 10 m against 5 m is W_ii 25 / 2 per epoch under a 10 m bias."""
     h = seven()
-    np.testing.assert_allclose(np.diag(bb.projector(h)), [0.57, 0.32, 0.57, 0.33, 0.58, 0.21, 0.43], atol=0.01)
+    np.testing.assert_allclose(
+        np.diag(bb.projector(h)), [0.57, 0.32, 0.57, 0.33, 0.58, 0.21, 0.43], atol=0.01
+    )
     w, r, rows, mu = banks(h, 4.0, 10.0, 400, 40, 3, row=2)
     out = log_run(w, r, rows, mu, 1e-300)
     odds = out[:, -1, index_of(rows, mu, 2, 10.0)] - out[:, -1, index_of(rows, mu, 2, 5.0)]
@@ -96,7 +100,9 @@ def test_rate_law_and_redundancy_numbers():
     assert abs(odds.mean() - 40 * drift) < 5 * math.sqrt(2 * 40 * drift / 400)
 
 
-@pytest.mark.parametrize(("var", "row", "median", "upper"), [(1.0, 1, 3, 5), (2.1, 2, 3, 5), (12.5, 2, 10, 25)])
+@pytest.mark.parametrize(
+    ("var", "row", "median", "upper"), [(1.0, 1, 3, 5), (2.1, 2, 3, 5), (12.5, 2, 10, 25)]
+)
 def test_detection_delays_of_the_acceptance_table(var, row, median, upper):
     w, r, rows, mu = banks(seven(), var, 10.0, 600, 200, 4, row=row)
     out = log_run(w, r, rows, mu, 1e-6)

@@ -33,6 +33,16 @@ def test_discretise_and_van_loan_agree_with_the_exponential():
     np.testing.assert_allclose(qd_exact, fine, rtol=1e-7)
 
 
+def test_psd_root_keeps_the_small_units():
+    """Radians and metres in one matrix: every entry to 1e-12 of its own scale."""
+    d = np.array([1e-9, 1e-7, 1.0, 30.0])
+    c = np.eye(4) + 0.3 * (np.ones((4, 4)) - np.eye(4))
+    m = c * np.outer(d, d)
+    root = eskf.psd_root(m)
+    np.testing.assert_allclose(root @ root.T, m, rtol=1e-12)
+    assert not eskf.psd_root(np.zeros((2, 2))).any()
+
+
 def test_lyapunov_steady_state():
     """A stable scalar Gauss-Markov state settles at q / (2 beta)."""
     phi, qd = eskf.van_loan(np.array([[-0.5]]), np.array([0.2]), 0.1)

@@ -62,7 +62,9 @@ def format_table(rows: list[dict]) -> str:
 
     table = [COLUMNS, *(tuple(text(r[c]) for c in COLUMNS) for r in rows)]
     width = [max(len(line[i]) for line in table) for i in range(len(COLUMNS) - 1)]
-    return "\n".join("  ".join([*(c.ljust(w) for c, w in zip(line, width)), line[-1]]).rstrip() for line in table)
+    return "\n".join(
+        "  ".join([*(c.ljust(w) for c, w in zip(line, width)), line[-1]]).rstrip() for line in table
+    )
 
 
 def save_figure(figure, out_dir: str | Path, name: str) -> Path:

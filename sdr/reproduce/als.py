@@ -97,13 +97,17 @@ def offdiagonal_rows(problem, log, settle, n_d, runs, rng) -> tuple[list[dict], 
     rows, kept = [], {}
     for sigma in (10.0, 30.0):
         for n_lags in (1, 2):
-            kept[sigma, n_lags] = monte_carlo(log, problem.p0, sigma, settle, n_d, n_lags, runs, rng, full=True)
+            kept[sigma, n_lags] = monte_carlo(
+                log, problem.p0, sigma, settle, n_d, n_lags, runs, rng, full=True
+            )
         mc = kept[sigma, 2]
         ours = float(np.sqrt(np.mean(mc["off"].mean(axis=0) ** 2)))
         plain = float(np.sqrt(np.mean(mc["plain_off"].mean(axis=0) ** 2)))
         floor = sigma**2 / np.sqrt(n_d * runs)
         verdict = "reproduced" if ours < 0.5 * plain else "not reproduced"
-        note = f"rms over pairs of the mean off-diagonal, m^2; uncompensated {plain:.2f}, MC floor {floor:.2f}"
+        note = (
+            f"rms over pairs of the mean off-diagonal, m^2; uncompensated {plain:.2f}, MC floor {floor:.2f}"
+        )
         item = f"off-diagonals ALS N=2, {sigma:.0f} m, Nd {n_d}"
         rows.append(row(item, "closer to zero than N=1", ours, None, None, verdict, note))
         one = float(np.sqrt(np.mean(kept[sigma, 1]["off"].mean(axis=0) ** 2)))
@@ -141,14 +145,21 @@ def two_pass(log, problem, truth_m, settle, n_d, runs, rng) -> tuple[np.ndarray,
         one = als.solve(model, als.autocovariance(r[:, i], window.used, 2, settle))
         var = np.maximum(np.diag(one.r_cov_m2), 1e-2)
         tail = slice(n, 2 * n)
-        again = eskf.linear_log(problem.phi[tail], problem.qd[tail], problem.h[tail], var, one.covariance, problem.dt_s)
+        again = eskf.linear_log(
+            problem.phi[tail], problem.qd[tail], problem.h[tail], var, one.covariance, problem.dt_s
+        )
         r2, _ = eskf.replay(again, one.covariance, truth_m**2, 1, rng, e0=err[-1, i : i + 1])
         filled = again._replace(r=r2[:, 0])
         two = als.estimate(filled, settle=settle)
         first.append(one.sigma_m)
         second.append(two.sigma_m)
         tuned = eskf.linear_log(
-            problem.phi[tail], problem.qd[tail], problem.h[tail], np.diag(two.r_cov_m2), one.covariance, problem.dt_s
+            problem.phi[tail],
+            problem.qd[tail],
+            problem.h[tail],
+            np.diag(two.r_cov_m2),
+            one.covariance,
+            problem.dt_s,
         )
         r3, _ = eskf.replay(tuned, one.covariance, truth_m**2, 1, rng, e0=err[-1, i : i + 1])
         values, _ = eskf.nis(tuned._replace(r=r3[:, 0]))
@@ -164,7 +175,11 @@ def two_pass_rows(settle, n_d, runs, rng) -> tuple[list[dict], tuple]:
     first, second, nis = two_pass(log, problem, truth, settle, n_d, runs, rng)
     clean = truth == 1.0
     rows = []
-    for name, part in (("clean satellites, truth 1 m", clean), ("truth 30 m", truth == 30), ("truth 10 m", truth == 10)):
+    for name, part in (
+        ("clean satellites, truth 1 m", clean),
+        ("truth 30 m", truth == 30),
+        ("truth 10 m", truth == 10),
+    ):
         for label, data in (("first", first), ("second", second)):
             mean, low, high = mean_interval(data[:, part])
             note = f"std of one estimate {data[:, part].std(axis=0, ddof=1).mean():.3f} m"
@@ -236,7 +251,9 @@ def figures(out: Path, kept: dict, off: dict, n_d: int, unequal: tuple) -> None:
             ax.set_title(f"satellite {s + 1}", fontsize=8)
         axes.flat[0].legend(fontsize=7)
         axes.flat[7].axis("off")
-        fig.suptitle(f"Seed 000 fig. {diag_fig}: {sigma} m noise, sqrt(diag R-hat) per residual bank, {label}, m")
+        fig.suptitle(
+            f"Seed 000 fig. {diag_fig}: {sigma} m noise, sqrt(diag R-hat) per residual bank, {label}, m"
+        )
         save_figure(fig, out, f"fig{diag_fig:02d}_diagonal")
         fig, ax = new_figure(1, 1, size=(9, 4.5))
         x = np.arange(UPPER[0].size)

@@ -90,11 +90,15 @@ def seven_rows(log_p: np.ndarray, where: str, sat: int) -> list[dict]:
     half = 1.96 * both.std(ddof=1) / math.sqrt(both.size)
     verdict = "reproduced" if both.mean() > 0.99 else "not reproduced"
     note = "mean over runs at epoch 20"
-    rows.append(row(f"{where}: P(5) + P(10)", 1.0, both.mean(), both.mean() - half, both.mean() + half, verdict, note))
+    rows.append(
+        row(f"{where}: P(5) + P(10)", 1.0, both.mean(), both.mean() - half, both.mean() + half, verdict, note)
+    )
     last = min(399, five.shape[1] - 1)
     trace = ", ".join(f"{five[:, e].mean():.2f} @ {e + 1}" for e in (4, 9, 49, last))
     note = f"P(5): {trace}. The split is a transient: 7 is nearer 5, log odds drift 2.5 W_ii / epoch"
-    rows.append(row(f"{where}: P(5) at the end", "divided", five[:, last].mean(), verdict="not reproduced", note=note))
+    rows.append(
+        row(f"{where}: P(5) at the end", "divided", five[:, last].mean(), verdict="not reproduced", note=note)
+    )
     wrong, low, high = share((log_p[:, :, index_of(sat, 10.0)] > DECLARE).any(axis=1))
     note = "without floor; a floor of 1e-6 lets a run change its mind more often"
     rows.append(row(f"{where}: runs that pass through P(10) > 0.99", None, wrong, low, high, note=note))
@@ -106,7 +110,9 @@ def half_way_row(runs: int, epochs: int, rng) -> dict:
     log_p = posterior(residuals(rng, runs, epochs, 1.0, 7.5, 1), 1.0)
     five, ten = log_p[:, :, index_of(1, 5.0)], log_p[:, :, index_of(1, 10.0)]
     rate, low, high = share((five > DECLARE).any(axis=1) & (ten > DECLARE).any(axis=1))
-    note = f"mean P(5) {np.exp(five[:, -1]).mean():.2f} at the end: divided in the mean only, never in one run"
+    note = (
+        f"mean P(5) {np.exp(five[:, -1]).mean():.2f} at the end: divided in the mean only, never in one run"
+    )
     return row("7.5 m, cov 1: runs that declare 5 m and 10 m in turn", None, rate, low, high, note=note)
 
 
@@ -118,7 +124,9 @@ def other_readings(runs: int, epochs: int, rng) -> list[dict]:
     p = np.exp(posterior(r, 12.5**2)[:, :, target])
     note = f"P(10 m) = {p[:, 9].mean():.2f} after 10 and {p[:, 49].mean():.2f} after 50 epochs: unconverged on a short plot"
     done, low, high = share(np.isfinite(delays(posterior(r, 12.5**2), target)))
-    rows.append(row("12.5 as std, filter told the truth: converged", "no", done, low, high, "not stated", note))
+    rows.append(
+        row("12.5 as std, filter told the truth: converged", "no", done, low, high, "not stated", note)
+    )
     hyp_rows, mu = bb.hypotheses(np.array(GRID_M), 7)
     h = hd.range_rows()
     out = np.empty((runs, epochs, mu.size))
@@ -126,19 +134,33 @@ def other_readings(runs: int, epochs: int, rng) -> list[dict]:
     bb.run_many_linear(bb.weight_matrix(h, np.ones(7)), r, hyp_rows, mu, norm, out)
     nan, low, high = share(np.isnan(out[:, -1, 0]))
     note = "all densities of eq. 18 underflow, 0/0: the probable reading of 'did not converge'"
-    rows.append(row("12.5 as std, eq. 19 linear, told sigma 1: NaN", "no convergence", nan, low, high, "reproduced", note))
+    rows.append(
+        row(
+            "12.5 as std, eq. 19 linear, told sigma 1: NaN",
+            "no convergence",
+            nan,
+            low,
+            high,
+            "reproduced",
+            note,
+        )
+    )
     for bias, name in ((10.0, "10 m"), (0.0, "no bias")):
         r = residuals(rng, runs, epochs, 12.5, bias, sat)
         declared = posterior(r, 1.0) > DECLARE
         declared[:, :, index_of(sat, bias)] = False
         rate, low, high = share(declared.any(axis=(1, 2)))
         note = "why the bank needs the true R, from ALS"
-        rows.append(row(f"variance 12.5 told 1, {name}: a wrong declaration", None, rate, low, high, note=note))
+        rows.append(
+            row(f"variance 12.5 told 1, {name}: a wrong declaration", None, rate, low, high, note=note)
+        )
     r = residuals(rng, runs, epochs, 12.5, 10.0, sat)
     declared = posterior(r, 12.5) > DECLARE
     declared[:, :, target] = False
     rate, low, high = share(declared.any(axis=(1, 2)))
-    rows.append(row("variance 12.5 told 12.5, 10 m: a wrong declaration", None, rate, low, high, note="calibrated"))
+    rows.append(
+        row("variance 12.5 told 12.5, 10 m: a wrong declaration", None, rate, low, high, note="calibrated")
+    )
     return rows
 
 
@@ -155,7 +177,9 @@ def redetection(runs: int, rng) -> tuple[list[dict], dict]:
         q = np.quantile(wait, (0.5, 0.95))
         name = "none" if floor == 0 else f"{floor:g}"
         note = f"95 % {q[1]:.0f}; clean runs with a dip P(0) < 0.5: {rate:.3f} ({low:.3f}-{high:.3f})"
-        rows.append(row(f"bias after 300 clean epochs, floor {name}: median delay, epochs", None, q[0], note=note))
+        rows.append(
+            row(f"bias after 300 clean epochs, floor {name}: median delay, epochs", None, q[0], note=note)
+        )
         kept[name] = np.exp(log_p[0, :, target])
     hyp_rows, mu = bb.hypotheses(np.array(GRID_M), 7)
     h = hd.range_rows()
@@ -165,7 +189,9 @@ def redetection(runs: int, rng) -> tuple[list[dict], dict]:
     with np.errstate(invalid="ignore"):
         found, low, high = share((out[:, 300:, target] > 0.99).any(axis=1))
     note = "the hypothesis had underflowed to 0; the seed says 'repeated periodically', which restarts it"
-    rows.append(row("bias after 300 clean epochs, eq. 19 as printed: detected", None, found, low, high, note=note))
+    rows.append(
+        row("bias after 300 clean epochs, eq. 19 as printed: detected", None, found, low, high, note=note)
+    )
     kept["eq. 19"] = np.nan_to_num(out[0, :, target])
     return rows, kept
 
@@ -182,7 +208,9 @@ def fit_rows(runs: int, rng) -> list[dict]:
                 report = bank(r, h, np.ones(7))
             declared[i] = report.declared
         rate, low, high = share(declared)
-        note = "30 epochs, 10-epoch chi-square fit at 1e-4" + ("; the truth is outside the grid" if bias > 10 else "")
+        note = "30 epochs, 10-epoch chi-square fit at 1e-4" + (
+            "; the truth is outside the grid" if bias > 10 else ""
+        )
         rows.append(row(f"with fit test, {bias:g} m, cov 1: declared", None, rate, low, high, note=note))
     return rows
 
@@ -207,7 +235,9 @@ def figures(out: Path, kept: dict, again: dict) -> None:
             ax.plot(np.arange(1, shown + 1), p[0, :shown, index], color="C0", lw=1.6)
             ax.set_ylabel(f"P({hypothesis:g} m)")
             ax.set_ylim(-0.03, 1.03)
-        axes[0].set_title(f"Seed 002 fig. {number}: {bias:g} m on satellite {sat + 1}, cov {var:g} (one run; grey: 20 runs)")
+        axes[0].set_title(
+            f"Seed 002 fig. {number}: {bias:g} m on satellite {sat + 1}, cov {var:g} (one run; grey: 20 runs)"
+        )
         axes[2].set_xlabel("epoch")
         save_figure(fig, out, f"fig{number:02d}_probability")
     fig, ax = new_figure(1, 1, size=(8, 4))
