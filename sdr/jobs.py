@@ -14,7 +14,6 @@ from sdr.scenario import ReceiverSpec, Scenario
 from sdr.store import Store
 from signals.geodesy import ecef_to_geodetic
 from signals.modulation import SIGNALS
-from signals.source import SyntheticSource
 from tracking.acquisition import AcquisitionSpec, slab_samples
 from tracking.acquisition import acquire as search
 from tracking.channel import STATE_LOCKED
@@ -37,7 +36,7 @@ def run(
 ) -> dict[str, Any]:
     """Synthesise the scenario ``name`` and receive it in one stream."""
     spec, text = _scenario(name, overrides, threads)
-    source = SyntheticSource(spec)
+    source = scenario.source(spec, threads)
     path = Path(output) if output else Path(f"{spec.name}.h5")
     with Store(path, command="run", scenario=text, seed=spec.seed) as store:
         result = _receive(spec.receiver, source, store, spec.name, quiet)
@@ -69,7 +68,7 @@ def simulate(
 ) -> dict[str, Any]:
     """Write the scenario's samples as a recording, and the truth in HDF5 beside it."""
     spec, text = _scenario(name, overrides, threads)
-    source = SyntheticSource(spec)
+    source = scenario.source(spec, threads)
     begin = time.perf_counter()
     base = (
         output.with_suffix("") if output.suffix in (".sigmf-meta", ".sigmf-data", ".bin", ".h5") else output
@@ -80,12 +79,17 @@ def simulate(
         Store(truth_path, command="simulate", scenario=text, seed=spec.seed) as store,
         _progress(spec.name, source.n_samples, quiet) as advance,
     ):
-        while (read := source.read(round(0.1 * source.fs_hz))) is not None:
-            writer.write(read[1])
-            _store_truth(store, source)
+        truth = _Truth(source, store)
+        done = 0
+        while done < source.n_samples:
+            n0, iq = source.read(round(0.1 * source.fs_hz))
+            done = n0 + iq.shape[1]
+            writer.write(iq)
+            truth.up_to(done)
             if store.due():
                 store.checkpoint()
-            advance(read[0] + read[1].shape[1])
+            advance(done)
+        truth.up_to(done, last=True)
     elapsed = time.perf_counter() - begin
     files = [str(p) for p in writer.files] + [str(truth_path)]
     duration_s = source.n_samples / source.fs_hz
@@ -133,10 +137,10 @@ def acquire(
 
 
 def _first(source: Any, file: Path, n: int) -> tuple[int, np.ndarray]:
-    read = source.read(min(n, source.n_samples))
-    if read is None:
+    n0, iq = source.read(min(n, source.n_samples))
+    if iq.shape[1] == 0:
         raise ValueError(f"'{file}' holds no samples in the part that was asked for")
-    return read
+    return n0, iq
 
 
 def _scenario(name: str, overrides: Sequence[str], threads: int) -> tuple[Scenario, str]:
@@ -169,17 +173,19 @@ class _Tally:
 
 def _receive(spec: ReceiverSpec, source: Any, store: Store, label: str, quiet: bool) -> dict[str, Any]:
     receiver = Receiver(spec, source)
+    truth = _Truth(source, store)
     tally = _Tally()
     begin = time.perf_counter()
     try:
         with _progress(label, source.n_samples, quiet) as advance:
             for outcome in receiver:
                 _store_outcome(store, receiver, outcome, tally)
-                _store_truth(store, source)
+                truth.up_to(outcome.n_end)
                 if store.due():
                     store.checkpoint()
                 advance(outcome.n_end, f"{len(receiver.channel_of)} tracked, {len(tally.fixes)} fixes")
     finally:
+        truth.up_to(receiver.position, last=True)
         _store_theory(store, receiver)
     duration_s = receiver.position / receiver.fs_hz
     result: dict[str, Any] = {
@@ -224,12 +230,19 @@ def _replica(receiver: Receiver, signal: str) -> str:
     return "BOC11" if boc else SIGNALS[signal].waveform
 
 
-def _store_truth(store: Store, source: Any) -> None:
-    truth = getattr(source, "take_truth", None)
-    if truth is not None:
-        satellites, receiver = truth()
-        store.append("truth/satellites", satellites)
-        store.append("truth/receiver", receiver)
+class _Truth:
+    """Writes the truth of a synthetic source at 10 Hz, a second at a time; a recording has none."""
+
+    def __init__(self, source: Any, store: Store) -> None:
+        self._source, self._store = source, store
+        self._index = source.truth_index() if hasattr(source, "truth_index") else np.empty(0, np.uint64)
+
+    def up_to(self, sample: int, last: bool = False) -> None:
+        ready = self._index[: np.searchsorted(self._index, sample)]
+        if len(ready) >= 10 or (last and len(ready)):
+            self._store.append("truth/satellites", self._source.truth(ready))
+            self._store.append("truth/receiver", self._source.pvt_truth(ready))
+            self._index = self._index[len(ready) :]
 
 
 def _store_theory(store: Store, receiver: Receiver) -> None:

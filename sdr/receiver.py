@@ -33,8 +33,8 @@ class Source(Protocol):
     if_hz: float
     n_samples: int
 
-    def read(self, n: int) -> tuple[int, np.ndarray] | None:
-        """The next slab of at most ``n`` samples, (n0, iq); None at the end."""
+    def read(self, n: int) -> tuple[int, np.ndarray]:
+        """The next slab of at most ``n`` samples, (n0, iq); an empty one at the end."""
 
 
 @dataclass
@@ -74,9 +74,11 @@ class Receiver:
         slab = round(self.spec.slab_ms * 1e-3 * self.fs_hz)
         every = max(1, round(1.0 / (self.spec.navigation.rate_hz * self.spec.slab_ms * 1e-3)))
         k = 0
-        while (read := self.source.read(slab)) is not None:
+        while True:
+            n0, iq = self.source.read(slab)
+            if iq.shape[1] == 0:
+                return
             k += 1
-            n0, iq = read
             yield self._advance(n0, iq, navigate=k % every == 0)
 
     def _advance(self, n0: int, iq: np.ndarray, navigate: bool) -> Outcome:

@@ -10,12 +10,14 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from nav.navigator import NavigationSpec
 from signals.clock import ClockSpec
 from signals.frontend import FrontEndSpec
 from signals.sky import SkySpec
+from signals.source import SyntheticSource
 from signals.trajectory import MotionSpec, Static
 from tracking.acquisition import AcquisitionSpec
 from tracking.channel import TrackingSpec
@@ -54,6 +56,22 @@ class Scenario(BaseModel):
     clock: ClockSpec = ClockSpec()
     front_end: FrontEndSpec = FrontEndSpec()
     receiver: ReceiverSpec = ReceiverSpec()
+
+
+NOISE, CLOCK, SKY, JAMMERS, MULTIPATH, SENSORS = range(6)
+"""Every random part of a scenario has a child seed of its own: changing one part leaves the others' bits alone."""
+
+
+def source(spec: Scenario, threads: int = 1) -> SyntheticSource:
+    """The samples of a scenario."""
+    sky = spec.sky.start(
+        spec.motion.start(), spec.clock.start(_child(spec, CLOCK), spec.duration_s), spec.duration_s, _child(spec, SKY)
+    )
+    return SyntheticSource(sky, spec.front_end, spec.duration_s, _child(spec, NOISE), threads=threads)
+
+
+def _child(spec: Scenario, part: int) -> np.random.SeedSequence:
+    return np.random.SeedSequence(spec.seed, spawn_key=(part,))
 
 
 def built_in() -> list[str]:

@@ -18,15 +18,17 @@ G0_MPS2 = 9.80665
 """Standard gravity (ISO 80000-3)."""
 
 OSCILLATORS = {
-    "TCXO": (2e-19, 2e-20),
-    "OCXO": (8e-20, 4e-23),
+    "TCXO": (1e-21, 2e-20),
+    "OCXO": (2.51e-26, 2.51e-22),
     "CSAC": (1.8e-19, 1e-27),
 }
 """h0 (s) and h-2 (1/s) of the one-sided fractional-frequency spectrum S_y(f) = h0 + h-2 / f^2.
 
-TCXO and OCXO: Brown and Hwang, Introduction to Random Signals and Applied Kalman Filtering (1997), table
-10.2 ("compensated crystal", "ovenized crystal"). CSAC: h0 = 2 tau ADEV^2 from 3e-10 at 1 s (data sheet);
-its h-2 is assumed.
+TCXO and OCXO: Irsigler and Eissfeller, PLL Tracking Performance in the Presence of Oscillator Phase Noise, GPS
+Solutions 5(4), 2002, table 1 (its flicker term h-1 is left out). The values of Brown and Hwang (1997), table 10.2,
+describe steps of a second in a navigation filter: their h0 of 2e-19 would move the carrier by 0.07 cycle in every
+20 ms, which no 10 Hz loop survives. CSAC: h0 = 2 tau ADEV^2 from 3e-10 at 1 s (data sheet); its h-2 is assumed. It
+is that noisy: a carrier loop behind a CSAC needs 25 Hz or more.
 """
 CLOCK_STEP_S = 0.02
 """Grid of the noise. Nodes at multiples of it reproduce the interpolated bias exactly."""
