@@ -154,7 +154,7 @@ def inversion(
     num = den = 0.0
     residual: list[np.ndarray] = []
     for sat in satellites:
-        spec = AcquisitionSpec(p_fa=1e-2, doppler_range_hz=None, doppler_center_hz=sat["doppler_hz"])
+        spec = AcquisitionSpec(p_fa=1e-2, doppler_range_hz=100.0, doppler_center_hz=sat["doppler_hz"])
         rows = [
             r[0]
             for d in range(dwells)
