@@ -329,6 +329,14 @@ def test_dummy_unknown_and_reserved_words_pass_without_effect() -> None:
     assert (decoder.ephemeris, decoder.tow_of(0), decoder.health, decoder.almanac) == (None, None, None, {})
 
 
+def test_alert_page_is_not_read_even_if_its_crc_holds() -> None:
+    alert = 1.0 - 2.0 * np.array(naive.page(bits_of(4 << 122, 128).tolist(), 8 * [0], page_type=1))
+    decoder = inav.Decoder(5)
+    events = decoder.feed(np.concatenate((page(63 << 122), alert, page(63 << 122))), 0)
+    assert types(events) == [63, -1, 63]
+    assert decoder.svid is None
+
+
 @pytest.mark.parametrize(("time", "known"), [(0, False), (1, False), (2, True), (3, False)])
 def test_word_0_counts_only_when_it_says_so(time: int, known: bool) -> None:
     decoder = inav.Decoder(5)
