@@ -53,16 +53,16 @@ def klobuchar(
 
     ``tow_s`` is GPS time of week or of day; ``alpha``, ``beta`` hold four coefficients each, s/semicircle^n.
     """
-    columns, shape = _flat(lat_rad, lon_rad, azimuth_rad, elevation_rad, tow_s)
-    out = np.empty(columns[0].size)
-    coefficients = [np.ascontiguousarray(c, dtype=float) for c in (alpha, beta)]
-    _klobuchar_array(*columns, *coefficients, float(x_limit), out)
+    (lat, lon, az, el, tow), shape = _flat(lat_rad, lon_rad, azimuth_rad, elevation_rad, tow_s)
+    out = np.empty(lat.size)
+    a, b = (np.ascontiguousarray(c, dtype=float) for c in (alpha, beta))
+    _klobuchar_array(lat, lon, az, el, tow, a, b, float(x_limit), out)
     return out.reshape(shape)
 
 
 def saastamoinen(lat_rad, height_m, elevation_rad, humidity: float = RELATIVE_HUMIDITY) -> np.ndarray:
     """Tropospheric slant delay in m, broadcast over the inputs; standard atmosphere at the height."""
-    columns, shape = _flat(lat_rad, height_m, elevation_rad)
-    out = np.empty(columns[0].size)
-    _saastamoinen_array(*columns, float(humidity), out)
+    (lat, height, el), shape = _flat(lat_rad, height_m, elevation_rad)
+    out = np.empty(lat.size)
+    _saastamoinen_array(lat, height, el, float(humidity), out)
     return out.reshape(shape)

@@ -172,9 +172,8 @@ def _look(lat, lon, dx, dy, dz):
 
 
 @njit(cache=True, nogil=True)
-def _atmosphere(rx, ry, rz, dx, dy, dz, tow_s, iono_on, alpha, beta, tropo_on, humidity):
+def _atmosphere(lat, lon, height, dx, dy, dz, tow_s, iono_on, alpha, beta, tropo_on, humidity):
     """Ionospheric group delay and tropospheric delay, both in s, of one line of sight (d = satellite - r)."""
-    lat, lon, height = geodetic_kernel(rx, ry, rz)
     el, az = _look(lat, lon, dx, dy, dz)
     # A satellite below the mask is not synthesised; the floor only keeps its numbers finite.
     el = max(el, _MIN_ELEVATION_RAD)
@@ -205,6 +204,11 @@ def propagate_kernel(
         delay, delay rate, ionosphere (s), its rate, elevation, azimuth (rad), range (m), flight time (s).
     """
     w, h = EARTH_RATE_RAD_S, _RATE_STEP_S
+    place = np.empty((t_s.size, 3, 3))  # geodetic, at t - h, t, t + h
+    for j in range(t_s.size):
+        for i in range(3):
+            d = (i - 1) * h
+            place[j, i] = geodetic_kernel(r[j, 0] + d * v[j, 0], r[j, 1] + d * v[j, 1], r[j, 2] + d * v[j, 2])
     for s in range(k.shape[0]):
         for j in range(t_s.size):
             t, rx, ry, rz = t_s[j], r[j, 0], r[j, 1], r[j, 2]
@@ -220,20 +224,23 @@ def propagate_kernel(
                 vx, vy = cw * vx + sw * vy, cw * vy - sw * vx
                 dx, dy, dz = x - rx, y - ry, z - rz
                 rho = math.sqrt(dx * dx + dy * dy + dz * dz)
-                if it > 0:
+                if it == 1:  # the last round moves the satellite by less than a millimetre
+                    g = place[j, 1]
                     iono, tropo = _atmosphere(
-                        rx, ry, rz, dx, dy, dz, tow, iono_on, alpha, beta, tropo_on, humidity
+                        g[0], g[1], g[2], dx, dy, dz, tow, iono_on, alpha, beta, tropo_on, humidity
                     )
                 tau = rho / C_MPS + iono + tropo
             ux, uy, uz = dx / rho, dy / rho, dz / rho
             rvx, rvy, rvz = v[j, 0], v[j, 1], v[j, 2]
             lx, ly, lz = vx - rvx, vy - rvy, vz - rvz
+            g = place[j, 2]
             i1, t1 = _atmosphere(
-                rx + h * rvx, ry + h * rvy, rz + h * rvz, dx + h * lx, dy + h * ly, dz + h * lz,
+                g[0], g[1], g[2], dx + h * lx, dy + h * ly, dz + h * lz,
                 tow + h, iono_on, alpha, beta, tropo_on, humidity,
             )  # fmt: skip
+            g = place[j, 0]
             i0, t0 = _atmosphere(
-                rx - h * rvx, ry - h * rvy, rz - h * rvz, dx - h * lx, dy - h * ly, dz - h * lz,
+                g[0], g[1], g[2], dx - h * lx, dy - h * ly, dz - h * lz,
                 tow - h, iono_on, alpha, beta, tropo_on, humidity,
             )  # fmt: skip
             iono_rate, atm_rate = (i1 - i0) / (2.0 * h), (i1 + t1 - i0 - t0) / (2.0 * h)
@@ -242,8 +249,7 @@ def propagate_kernel(
             turn = w * (ux * y - uy * x)
             los = us - (ux * rvx + uy * rvy + uz * rvz)
             tau_rate = (los + C_MPS * atm_rate) / (C_MPS + us - turn)
-            lat, lon, _ = geodetic_kernel(rx, ry, rz)
-            el, az = _look(lat, lon, dx, dy, dz)
+            el, az = _look(place[j, 1, 0], place[j, 1, 1], dx, dy, dz)
             out[0, s, j] = tau - clock + offset_s[s]
             out[1, s, j] = tau_rate - clock_rate * (1.0 - tau_rate)
             out[2, s, j] = iono

@@ -97,7 +97,7 @@ def check_ephemeris(ephemeris: np.ndarray) -> None:
     """Raise ValueError for elements outside what the messages can hold; the satellite is named."""
     for eph in np.atleast_1d(ephemeris):
         name = f"{eph['system'].decode()}{int(eph['prn']):02d}"
-        values = [eph[f] for f in EPHEMERIS.names if EPHEMERIS[f].kind == "f"]
+        values = [eph[f] for f in EPHEMERIS.names or () if EPHEMERIS[f].kind == "f"]
         if not np.all(np.isfinite(values)):
             raise ValueError(f"ephemeris of {name} holds a value that is not a number: leave it out")
         if not 0.0 <= eph["e"] < 0.5:

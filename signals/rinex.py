@@ -300,7 +300,7 @@ def _iono_utc(path, header: list[str], eph: np.ndarray) -> np.ndarray:
             _header_line(out, line[:60], line[60:].strip())
     except (ValueError, OverflowError):
         raise ValueError(f"RINEX file {path}: the header line {line.strip()!r} is malformed") from None
-    if not all(np.all(np.isfinite(out[f])) for f in IONO_UTC.names):
+    if not all(np.all(np.isfinite(out[f])) for f in IONO_UTC.names or ()):
         raise ValueError(f"RINEX file {path}: an ionosphere or time correction of the header is not finite")
     return out
 
@@ -395,7 +395,7 @@ def _orbit_lines(eph: np.ndarray) -> list[str]:
         - SECONDS_PER_WEEK // 2
     )
     toc = calendar(0, toe_abs + to_toc)
-    name = f"{eph['system'].decode()}{int(eph['prn']):02d}"
+    name = f"{bytes(eph['system']).decode()}{int(eph['prn']):02d}"
     return [
         f"{name} {toc:%Y %m %d %H %M %S}" + _cells(eph["af0_s"], eph["af1_s_s"], eph["af2_s_s2"]),
         "    " + _cells(eph["iode"], eph["crs_m"], eph["delta_n_rad_s"], eph["m0_rad"]),

@@ -496,7 +496,8 @@ def _positions(path, form: str, table: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def _read_nmea(path, lines: list[str]) -> tuple[np.ndarray, np.ndarray]:
-    rows, day_s = [], 0.0
+    rows: list[tuple[float, ...]] = []
+    day_s = 0.0
     for number, line in enumerate(lines, 1):
         if line[3:7] != "GGA,":
             continue
