@@ -32,7 +32,7 @@ from tracking.twin_kernels import (
     TWIN_COLUMNS,
     bit_signs,
     closed_loop,
-    line_sequence,
+    cw_sequences,
     normals_columns,
 )
 
@@ -69,13 +69,11 @@ TWIN_EPOCH = np.dtype(
 )
 """One integration of the twin."""
 
-_NEAR = 2  # code lines on each side of a jammer's nearest line that are kept
+_NEAR = 1024  # code lines kept on each side of a jammer, divided by (code periods in T)^2; see _near
+_MARGIN = 0.5  # how far the loops' frequency may leave the truth, in units of 1 / T, before a CW is held
 _MAX_TAPS = 512
-_FAINT = 1e-5  # of the prompt: an open-loop line below it is left out
-_MAX_LINES = 20_000
-_SLOW_LINES = (
-    24  # up to this many lines, narrow-band noise keeps its exact correlation in time and between lines
-)
+_MAX_TERMS = 512
+_SLOW_BT = 8.0  # up to this B T, narrow-band noise keeps its exact correlation in time and over the taps
 _NBI_BLOCK = 4096  # epochs; overlapped by half
 _TABLE_CHIPS = {"BPSK": 1, "BOC11": 2, "CBOC+": 12, "CBOC-": 12}
 
@@ -299,13 +297,49 @@ def _noise_factor(signal, prn, waveform, taps):
         return vector * np.sqrt(np.maximum(value, 0.0))
 
 
+def _near(periods):
+    """Lines on each side that keep the truncated sum within 0.014 of a typical line: 2 / (pi N eps)^2."""
+    return max(16, math.ceil(_NEAR / periods**2))
+
+
 def _line_vectors(spec, k, taps):
-    """conj(c_k) e^{-2 pi i k d / L}, complex64 (n, K), and c_k kept exact."""
+    """conj(c_k) e^{-2 pi i k d / L}, complex128 (n, K)."""
     k = np.asarray(k)
     length = SIGNALS[spec.signal].code_length_chips
     c = np.conj(code_spectrum(spec.signal, spec.prn, k, spec.waveform))
     turns = np.mod(k[:, None] * (taps[None, :] / length), 1.0)
-    return (c[:, None] * np.exp(-2j * np.pi * turns)).astype(np.complex64)
+    return c[:, None] * np.exp(-2j * np.pi * turns)
+
+
+def _tap_vectors(spec, x, taps):
+    """Taps of a unit CW of frequency x / T whose phase is zero at mid-interval, complex128 (n, K).
+
+    sum_k conj(c_k) sinc(x - k N) e^{-2 pi i k (N / 2 + d / L)}, N code periods in T.
+    """
+    N = round(spec.integration_s / SIGNALS[spec.signal].code_period_s)
+    near = _near(N)
+    k = np.arange(math.floor(x.min() / N) - near, math.ceil(x.max() / N) + near + 1)
+    sign = np.where(k * N % 2 == 0, 1.0, -1.0)
+    return (np.sinc(x[:, None] - k * N) * sign) @ _line_vectors(spec, k, taps)
+
+
+def _chebyshev(spec, low, high, taps):
+    """Chebyshev coefficients of the tap vectors over f T in [low, high] -> (centre, half width), complex64 (J, K).
+
+    The sinc has exponential type pi: terms fall like (pi w / 2)^j / j!.
+    """
+    half = max(0.5 * (high - low), 1e-9)
+    n = 1 if half < 1e-6 else math.ceil(math.pi * half) + 8
+    if n > _MAX_TERMS:
+        raise ValueError(
+            f"a jammer sweeps {2 * half:.0f} / T within {BLOCK_EPOCHS} integrations: lower rate_hz_s or "
+            "use samples instead of the twin"
+        )
+    angle = np.pi * (np.arange(n) + 0.5) / n
+    values = _tap_vectors(spec, 0.5 * (low + high) + half * np.cos(angle), taps)
+    basis = np.cos(np.outer(np.arange(n), angle)) * (2.0 / n)
+    basis[0] *= 0.5
+    return (0.5 * (low + high), half), (basis @ values).astype(np.complex64)
 
 
 def jammer_hz(spec, jammer):
@@ -342,12 +376,10 @@ def _cw_rows(spec, rng):
         rows.append(base)
         if spec.fs_hz is None:
             continue
-        # A sampled product repeats the spectrum at fs; the middle of n samples lies (n - 1) / 2 samples in.
-        odd = (round(spec.integration_s * spec.fs_hz) - 1) % 2
+        # A product that is sampled at t = i / fs sees the jammer repeated at every fs.
         for m in range(-spec.alias_orders, spec.alias_orders + 1):
             if m:
-                shift = 0.5 * (m * odd % 2)
-                rows.append([base[0] + m * spec.fs_hz, base[1], base[2] + shift, *base[3:]])
+                rows.append([base[0] + m * spec.fs_hz, *base[1:]])
     return np.array(rows, float).reshape(len(rows), 6)
 
 
@@ -394,7 +426,11 @@ class _Stage:
 
 
 class _SlowNBI:
-    """Narrow-band noise through few lines: exact in time and between lines, made in overlapped FFT blocks."""
+    """Noise of small B T: exact in time and over the taps, made in overlapped FFT blocks.
+
+    A sum of many Gaussian tones; the tap vector of each by the Chebyshev series over the band, so that J sequences of
+    epochs times J tap vectors make the whole.
+    """
 
     def __init__(self, stage, number, jammer):
         spec = stage.spec
@@ -402,29 +438,25 @@ class _SlowNBI:
         self.seed = np.random.SeedSequence(
             stage.nbi_seed.entropy, spawn_key=(*stage.nbi_seed.spawn_key, number)
         )
-        centre = jammer_hz(spec, jammer)
+        self.centre_hz = jammer_hz(spec, jammer)
         grid = 1.0 / (_NBI_BLOCK * self.T)
-        low, high = centre - 0.5 * jammer.bandwidth_hz, centre + 0.5 * jammer.bandwidth_hz
+        low, high = (self.centre_hz + s * 0.5 * jammer.bandwidth_hz for s in (-1, 1))
         self.bins = np.arange(math.ceil(low / grid), math.floor(high / grid) + 1)
         if len(self.bins) < 4:
             raise ValueError(
-                f"bandwidth_hz = {jammer.bandwidth_hz:g} is below {4 * grid:.3g}, the least the "
-                f"twin resolves at "
-                f"T = {self.T:g} s; use a CW jammer"
+                f"bandwidth_hz = {jammer.bandwidth_hz:g} is below {4 * grid:.3g}, the least the twin resolves "
+                f"at T = {self.T:g} s; use a CW jammer"
             )
-        self.k = _nbi_lines(stage, centre, jammer.bandwidth_hz)
-        f = self.bins * grid
-        sinc = np.sinc((f[None, :] - self.k[:, None] * stage.line_hz) * self.T)
-        # Half an epoch from block start to mid-interval, and the code's own phase there.
-        turn = 0.5 * f * self.T - np.outer(self.k, [0.5 * stage.line_hz * self.T])
-        turn = turn - self.k[:, None] * spec.code_phase_chips / stage.length
-        self.gain = 10 ** (jammer.js_db / 20) * sinc * np.exp(2j * np.pi * turn)
-        self.step = np.mod(self.k * stage.line_hz * self.T, 1.0)
+        (centre, half), self.vectors = _chebyshev(spec, low * self.T, high * self.T, stage.taps)
+        u = np.clip((self.bins * grid * self.T - centre) / half, -1.0, 1.0)
+        turn = 0.5 * self.bins * grid * self.T  # block start to mid-interval
+        terms = np.cos(np.outer(np.arange(len(self.vectors)), np.arccos(u)))
+        self.gain = 10 ** (jammer.js_db / 20) * terms * np.exp(2j * np.pi * turn)
         self.window = np.sin(np.pi * (np.arange(_NBI_BLOCK) + 0.5) / _NBI_BLOCK)
         self.cache = {}
 
     def _half_blocks(self, index):
-        """One windowed block, complex128 (n_k, _NBI_BLOCK), that starts at epoch (index - 1) _NBI_BLOCK /
+        """One windowed block, complex128 (J, _NBI_BLOCK), that starts at epoch (index - 1) _NBI_BLOCK /
         2.
         """
         if index not in self.cache:
@@ -432,17 +464,16 @@ class _SlowNBI:
             rng = np.random.Generator(np.random.Philox(seed))
             g = rng.standard_normal((2, len(self.bins))).T.copy().view(complex)[:, 0]
             g /= math.sqrt(2 * len(self.bins))
-            spectrum = np.zeros((len(self.k), _NBI_BLOCK), complex)
+            spectrum = np.zeros((len(self.gain), _NBI_BLOCK), complex)
             for row, gain in zip(spectrum, self.gain):
                 np.add.at(row, self.bins % _NBI_BLOCK, g * gain)
             x = np.fft.ifft(spectrum, axis=1) * _NBI_BLOCK
-            turns = np.mod(np.outer(self.step, np.arange(_NBI_BLOCK)), 1.0)
             self.cache = {i: v for i, v in self.cache.items() if i >= index - 2}
-            self.cache[index] = x * np.exp(-2j * np.pi * turns) * self.window
+            self.cache[index] = x * self.window
         return self.cache[index]
 
     def sequence(self, block, mid_s):
-        """Amplitude of each line, complex64 (n_k, E)."""
+        """Time sequence of each Chebyshev term, complex64 (J, E)."""
         half = _NBI_BLOCK // 2
         index, start = divmod(block * BLOCK_EPOCHS, half)
         old, new = self._half_blocks(index), self._half_blocks(index + 1)
@@ -458,7 +489,7 @@ class _WideNBI:
         self.jammer, self.key = jammer, np.uint64((int(stage.wide_key) + number) % 2**64)
         centre = jammer_hz(stage.spec, jammer)
         k = _nbi_lines(stage, centre, jammer.bandwidth_hz)
-        vectors = _line_vectors(stage.spec, k, stage.taps).astype(complex)
+        vectors = _line_vectors(stage.spec, k, stage.taps)
         power = _sinc2_mean(k * stage.line_hz - centre, jammer.bandwidth_hz, stage.spec.integration_s)
         C = (vectors.T * (power * 10 ** (jammer.js_db / 10))) @ vectors.conj()
         value, vector = np.linalg.eigh(0.5 * (C + C.conj().T))
@@ -479,14 +510,15 @@ class _WideNBI:
 
 
 def _nbi(stage, number, jammer):
-    n = len(_nbi_lines(stage, jammer_hz(stage.spec, jammer), jammer.bandwidth_hz))
-    return (_SlowNBI if n <= _SLOW_LINES else _WideNBI)(stage, number, jammer)
+    slow = jammer.bandwidth_hz * stage.spec.integration_s <= _SLOW_BT
+    return (_SlowNBI if slow else _WideNBI)(stage, number, jammer)
 
 
 def _nbi_lines(stage, centre_hz, bandwidth_hz):
     """Indices of the lines that the band reaches."""
-    low = round((centre_hz - 0.5 * bandwidth_hz) / stage.line_hz) - _NEAR
-    high = round((centre_hz + 0.5 * bandwidth_hz) / stage.line_hz) + _NEAR
+    near = min(32, _near(round(stage.spec.integration_s * stage.line_hz)))
+    low = round((centre_hz - 0.5 * bandwidth_hz) / stage.line_hz) - near
+    high = round((centre_hz + 0.5 * bandwidth_hz) / stage.line_hz) + near
     return np.arange(low, high + 1)
 
 
@@ -541,15 +573,21 @@ class TwinRun:
         self.loop = np.array([*gains, code_gain, scale, e, p, late, carrier, code])
         s = self.stage
         self.geometry = np.array(
-            [T, s.line_hz, s.length, spec.code_phase_chips, s.per_chip, CYCLES_PER_CHIP], float
+            [T, CHIP_RATE_HZ, s.length, spec.code_phase_chips, s.per_chip, CYCLES_PER_CHIP], float
         )
         first = self.truth(np.array([0.5 * T]))[0]
         _, _, accel = spec.dynamics.at(np.array([0.5 * T]))
         rate, ramp = first[1] * T, -accel[0] / WAVELENGTH_M * T * T
-        self.state = np.array([first[0], rate, rate, ramp, first[2], rate / CYCLES_PER_CHIP])
+        self.state = np.array([first[0], rate, rate, ramp, first[2]])
         self.epoch = 0
         self._block = None
-        self._lines = None
+        self._spans = None
+        slow = [n for n in s.nbis if isinstance(n, _SlowNBI)]
+        self._slow = slow
+        self._slow_hz = np.array([n.centre_hz for n in slow for _ in n.vectors], float)
+        self._slow_vectors = np.concatenate(
+            [np.zeros((0, len(taps)), np.complex64), *(n.vectors for n in slow)]
+        )
 
     def truth(self, t_s):
         """Carrier phase (cycles), frequency (Hz), code phase (chips) of the signal, float64 (n, 3),
@@ -603,7 +641,9 @@ class TwinRun:
             b.truth[lo:hi] = truth
         out = np.empty((BLOCK_EPOCHS, TWIN_COLUMNS))
         corr = np.empty((BLOCK_EPOCHS, len(self.stage.taps)), np.complex64)
-        cw_lines, vectors, slow_k, slow_row = self._vectors(b, lo, hi)
+        # From the whole block where the truth is the twin's own, so that cutting a run changes nothing.
+        reached = b.truth[:, 1] if truth is None else b.truth[lo:hi, 1]
+        spans, vectors = self._vectors(index, reached)
         closed_loop(
             self.state,
             index * BLOCK_EPOCHS,
@@ -620,10 +660,10 @@ class TwinRun:
             b.gain,
             b.chips,
             self.stage.cws,
-            cw_lines,
+            spans,
             vectors,
-            slow_k,
-            slow_row,
+            self._slow_hz,
+            self._slow_vectors,
             b.slow,
             self.geometry,
             self.loop,
@@ -641,7 +681,7 @@ class TwinRun:
         g = np.empty((len(s.taps), 2 * BLOCK_EPOCHS), np.float32)
         s.normals(s.key, index, g)
         rows = g.T @ s.factor.T
-        slow = [n.sequence(index, mid_s) for n in s.nbis if isinstance(n, _SlowNBI)]
+        slow = [n.sequence(index, mid_s) for n in self._slow]
         for n in s.nbis:
             if isinstance(n, _WideNBI):
                 rows += n.columns(s, index, mid_s).T
@@ -657,43 +697,38 @@ class TwinRun:
         )
         return self._block
 
-    def _vectors(self, block, lo, hi):
-        """Line tables that cover where the jammers go within the block; kept while they suffice."""
+    def _vectors(self, index, freq_hz):
+        """Chebyshev tables over where the jammers go within the block; kept while they suffice."""
         s = self.stage
-        ranges = _line_ranges(s.cws, s.mid_s(block.index)[[lo, hi - 1]], block.truth[lo:hi, 1], s.line_hz)
-        if self._lines is not None and _covers(self._lines[0], ranges):
-            return self._lines
-        slow_k = [n.k for n in s.nbis if isinstance(n, _SlowNBI)]
-        slow_k = np.concatenate(slow_k) if slow_k else np.zeros(0, np.int64)
-        # Room on both sides, so that a sweep does not rebuild the tables in every block.
-        table = np.array([[low - 4, high - low + 9, 0] for low, high in ranges], np.int64).reshape(-1, 3)
-        table[:, 2] = len(slow_k) + np.cumsum(table[:, 1]) - table[:, 1]
-        if table[:, 1].sum() > _MAX_LINES:
-            raise ValueError(
-                f"the jammers cross {table[:, 1].sum()} code lines within one block of "
-                f"{BLOCK_EPOCHS} epochs, more "
-                f"than {_MAX_LINES}: lower rate_hz_s"
-            )
-        k = np.concatenate([slow_k, *(np.arange(a, a + n) for a, n, _ in table)]).astype(np.int64)
-        slow_row = np.arange(len(slow_k), dtype=np.int64)
-        self._lines = table, _line_vectors(self.spec, k, s.taps), slow_k.astype(np.int64), slow_row
-        return self._lines
+        ranges = _reach(s.cws, s.mid_s(index), freq_hz, self.spec.integration_s)
+        if self._spans is not None and _covers(self._spans[0], ranges):
+            return self._spans
+        spans, vectors, row = [], [np.zeros((0, len(s.taps)), np.complex64)], 0
+        for low, high in ranges:
+            span, v = _chebyshev(self.spec, low - _MARGIN, high + _MARGIN, s.taps)
+            spans.append([*span, row, len(v)])
+            vectors.append(v)
+            row += len(v)
+        self._spans = np.array(spans, float).reshape(-1, 4), np.concatenate(vectors)
+        return self._spans
 
 
-def _line_ranges(cws, t_s, freq_hz, line_hz):
-    """First and last nearest line of each CW over a stretch of time, list of (low, high)."""
+def _reach(cws, mid_s, freq_hz, T):
+    """f T of each CW relative to the signal over a block, list of (low, high)."""
+    low, high = freq_hz.min(), freq_hz.max()
     out = []
-    for f, rate, *_ in cws:
-        reach = [f + rate * t for t in t_s]
-        # 20 Hz: what the loops may add to the truth before a jammer's nearest line is out of the table.
-        low = (min(reach) - freq_hz.max() - 20.0) / line_hz
-        high = (max(reach) - freq_hz.min() + 20.0) / line_hz
-        out.append((math.floor(low) - _NEAR, math.ceil(high) + _NEAR))
+    for f, rate, *_ in cws.tolist():
+        ends = f + rate * mid_s[0], f + rate * mid_s[-1]
+        out.append(((min(ends) - high) * T, (max(ends) - low) * T))
     return out
 
 
-def _covers(table, ranges):
-    return all(a <= low and high < a + n for (a, n, _), (low, high) in zip(table, ranges))
+def _covers(spans, ranges):
+    """Whether the tables still leave half the margin on both sides."""
+    spare = 0.5 * _MARGIN
+    return all(
+        c - h + spare <= low and high <= c + h - spare for (c, h, *_), (low, high) in zip(spans, ranges)
+    )
 
 
 def _with_taps(taps, spacing_chips):
@@ -728,7 +763,7 @@ class OpenLoopRun:
         self.stage = _Stage(spec, seed, spec.tap_array_chips)
         self.n_taps = len(self.stage.taps)
         self.R = autocorrelation(spec.signal, spec.prn, self.stage.taps, spec.waveform).astype(np.float32)
-        self._key = None
+        self._key, self._series = None, {}
         self.block_epochs = BLOCK_EPOCHS
 
     def block(self, index):
@@ -754,11 +789,11 @@ class OpenLoopRun:
             )
             self.inner[row, :n], self.inner[row, n:] = direct * g.real, direct * g.imag
             row += 1
-        turn = self.spec.code_phase_chips / s.length
-        for j, k in lines:
-            args = (s.cws[j], k, index * n, self.spec.integration_s, s.line_hz, turn, jam)
-            line_sequence(*args, self.inner[row])
-            row = self._quadrature(row)
+        shift_s = self.spec.code_phase_chips / CHIP_RATE_HZ
+        for j, (centre, half), terms in lines:
+            part = self.inner[row : row + 2 * terms]
+            cw_sequences(s.cws[j], centre, half, index * n, self.spec.integration_s, shift_s, jam, part)
+            row += 2 * terms
         mid_s = s.mid_s(index)
         for nbi in slow:
             for x in nbi.sequence(index, mid_s):
@@ -791,35 +826,33 @@ class OpenLoopRun:
         return row + 2
 
     def _lines(self, index):
-        """(jammer, line) pairs that matter in a block: the five nearest; of a parked CW those it leaks
-        into.
-        """
+        """(jammer, span, number of terms) of each CW that is on in a block; fills their tap vectors."""
         s = self.stage
-        T = self.spec.integration_s
-        first, last = (index * BLOCK_EPOCHS + 0.5) * T, ((index + 1) * BLOCK_EPOCHS - 0.5) * T
+        mid_s = s.mid_s(index)
         out = []
-        for j, (f, rate, _, amplitude, start, end) in enumerate(s.cws.tolist()):
-            if start > last or end <= first:
+        for j, (low, high) in enumerate(_reach(s.cws, mid_s, np.zeros(1), self.spec.integration_s)):
+            if s.cws[j, 4] > mid_s[-1] or s.cws[j, 5] <= mid_s[0]:
                 continue
-            f0, f1 = sorted((f + rate * first, f + rate * last))
-            for k in range(round(f0 / s.line_hz) - _NEAR, round(f1 / s.line_hz) + _NEAR + 1):
-                x = math.pi * (f - k * s.line_hz) * T
-                if rate or abs(x) < 1e-6 or abs(math.sin(x) / x) * amplitude > _FAINT:
-                    out.append((j, k))
+            if (j, low, high) not in self._series:
+                self._series = {key: v for key, v in self._series.items() if key[0] != j}
+                self._series[j, low, high] = _chebyshev(self.spec, low, high, s.taps)
+            span, vectors = self._series[j, low, high]
+            out.append((j, span, len(vectors)))
         return tuple(out)
 
     def _buffers(self, lines, n_echo, slow):
         if self._key == (lines, n_echo):
             return
         self._key = lines, n_echo
-        ks = [k for _, k in lines] + [k for n in slow for k in n.k]
+        series = {key[0]: v for key, (_, v) in self._series.items()}
+        vectors = [series[j] for j, *_ in lines] + [n.vectors for n in slow]
         K = self.n_taps
-        rows = K + 1 + n_echo + 2 * len(ks)
+        rows = K + 1 + n_echo + 2 * sum(map(len, vectors))
         self.left = np.zeros((K, rows), np.float32)
         self.left[:, :K] = self.stage.factor
         self.left[:, K] = self.R
-        if ks:
-            vectors = _line_vectors(self.spec, np.array(ks), self.stage.taps)
+        if vectors:
+            vectors = np.concatenate(vectors)
             self.left[:, K + 1 + n_echo :: 2] = vectors.real.T
             self.left[:, K + 2 + n_echo :: 2] = vectors.imag.T
         self.inner = np.empty((rows, 2 * BLOCK_EPOCHS), np.float32)

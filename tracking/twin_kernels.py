@@ -19,8 +19,8 @@ __all__ = [
     "acf_at",
     "bit_signs",
     "closed_loop",
+    "cw_sequences",
     "hatch_smooth",
-    "line_sequence",
     "normals_columns",
 ]
 
@@ -94,60 +94,54 @@ def _cycles(turn):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def line_sequence(cw, k, epoch0, integration_s, line_hz, code_turn, signs, out):
-    """Open-loop amplitude of a CW through code line ``k``, per epoch, without the line's own coefficient.
+def cw_sequences(cw, centre, half_width, epoch0, integration_s, shift_s, signs, out):
+    """Open-loop time sequences of a CW, one for each Chebyshev term of its tap vector.
 
-    out[e] = A s_e sinc((f - k f_R) T) exp(2 pi i (psi(t) - k (f_R t + p0 / L))), t mid-interval; the phases by
-    rotation from the first epoch. ``cw`` = (f_hz, rate_hz_s, phase_cycles, amplitude, start_s, end_s),
-    ``code_turn`` = p0 / L; ``out`` float32 (2 E,): real parts, then imaginary parts.
+    Row j: s_e A T_j(u) e^{2 pi i psi(t)}, u = (f T - centre) / half_width, t mid-interval - ``shift_s``; by
+    rotation and recurrence from the first epoch. ``cw`` = (f_hz, rate_hz_s, phase_cycles, amplitude,
+    start_s, end_s); ``out`` float32 (2 J, 2 E): row 2 j in-phase | quadrature, row 2 j + 1 the same times i.
     """
     n = signs.shape[0]
-    half = epoch0 + 0.5
-    t = half * integration_s
-    periods = line_hz * integration_s
-    turn_k = periods * half
-    turn = cw[2] + (cw[0] + 0.5 * cw[1] * t) * t - k * (turn_k - math.floor(turn_k) + code_turn)
-    f = cw[0] + cw[1] * t - k * line_hz
+    terms = out.shape[0] // 2
+    t = (epoch0 + 0.5) * integration_s - shift_s
     step_t2 = cw[1] * integration_s * integration_s
-    z = _cycles(turn)
-    w = _cycles(f * integration_s + 0.5 * step_t2)
+    z = _cycles(cw[2] + (cw[0] + 0.5 * cw[1] * t) * t)
+    w = _cycles((cw[0] + cw[1] * t) * integration_s + 0.5 * step_t2)
     w2 = _cycles(step_t2)
-    x, dx = f * integration_s, step_t2
-    h, dh = _cycles(0.5 * x), _cycles(0.5 * dx)
+    u = ((cw[0] + cw[1] * t) * integration_s - centre) / half_width
+    du = step_t2 / half_width
     for e in range(n):
         t = (epoch0 + e + 0.5) * integration_s
         a = cw[3] * signs[e] if cw[4] <= t < cw[5] else 0.0
-        y = math.pi * x
-        a *= h.imag / y if abs(y) > 1e-4 else 1.0 - y * y / 6.0
-        out[e] = a * z.real
-        out[n + e] = a * z.imag
+        previous, now = a * u, a  # T_-1 = T_1
+        for j in range(terms):
+            out[2 * j, e] = now * z.real
+            out[2 * j, n + e] = now * z.imag
+            out[2 * j + 1, e] = -now * z.imag
+            out[2 * j + 1, n + e] = now * z.real
+            previous, now = now, 2.0 * u * now - previous
         z *= w
         w *= w2
-        h *= dh
-        x += dx
+        u += du
 
 
 @njit(error_model="numpy")
-def _add_lines(z, cw, lines, vectors, geometry, half, theta, freq, tau, tau_rate, sign):
-    """Add one CW to the taps: the five code lines nearest to it, phases mid-interval (see
-    ``closed_loop``).
-    """
+def _add_cw(z, cw, span, vectors, geometry, half, theta, freq, tau, sign):
+    """Add one CW to the taps: phase at mid-interval, tap vector by its Chebyshev series in f T."""
     integration_s = geometry[0]
-    line_hz = geometry[1] + tau_rate / geometry[2]
-    t = half * integration_s
-    f = cw[0] + cw[1] * t - freq
-    turn_k = geometry[1] * integration_s * half
-    turn_k = turn_k - math.floor(turn_k) + (tau + geometry[3]) / geometry[2]
-    turn = cw[2] + (cw[0] + 0.5 * cw[1] * t) * t - theta
-    centre = int(round(f / line_hz))
-    for k in range(max(centre - 2, lines[0]), min(centre + 3, lines[0] + lines[1])):
-        gain = sign * cw[3] * _sinc((f - k * line_hz) * integration_s)
-        if abs(gain) < 1e-9:
-            continue
-        a = np.complex64(gain * _cycles(turn - k * turn_k))
-        row = lines[2] + k - lines[0]
+    t = half * integration_s - (tau + geometry[3]) / geometry[1]
+    f = cw[0] + cw[1] * t
+    u = (f - freq) * integration_s - span[0]
+    u = min(max(u / span[1], -1.0), 1.0)
+    a = sign * cw[3] * _cycles(cw[2] + (cw[0] + 0.5 * cw[1] * t) * t - theta)
+    row, last = int(span[2]), int(span[2] + span[3])
+    previous, now = u, 1.0
+    while row < last:
+        b = np.complex64(a * now)
         for i in range(z.shape[0]):
-            z[i] += a * vectors[row, i]
+            z[i] += b * vectors[row, i]
+        previous, now = now, 2.0 * u * now - previous
+        row += 1
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -167,10 +161,10 @@ def closed_loop(
     echo_gain,
     echo_chips,
     cws,
-    cw_lines,
+    spans,
     vectors,
-    slow_k,
-    slow_row,
+    slow_hz,
+    slow_vectors,
     slow,
     geometry,
     loop,
@@ -181,14 +175,15 @@ def closed_loop(
 
     z_d = D sinc(f_e T) e^{2 pi i th_e} [R(d - eps) + sum_i g_i R(d - eps + tau_i)] + CW, NBI + noise, with
     eps = tau - tau^, th_e = theta - theta^ at mid-interval; R the periodic autocorrelation; d > 0 early.
-    CW: sum_k A conj(c_k) sinc((f_J - f^ - k f_R^) T) e^{2 pi i (psi - theta^ - k (f_R t + (tau^ + d) / L))}.
-    Loops as ``tracking.loops``: a += K3 e, v += K2 e + a, rate = v + K1 e; the phase advances by the mean of old
-    and new rate, the code by the carrier's advance and K_code times its error.
+    CW: A e^{2 pi i (psi(t) - theta^)} sum_k conj(c_k) sinc((f_J - f^) T - k N) e^{-2 pi i k (N / 2 + d / L)},
+    N code periods in T, t = mid-interval - (tau^ + p0) / fc: integrations follow the replica's code.
+    Loops as ``tracking.loops``: a += K3 e, v += K2 e + a, rate = v + K1 e; the phase advances by the mean of
+    old and new rate, the code by the carrier's advance and K_code times its error.
 
     Parameters
     ----------
-    state : float64 (6,)
-        theta^ (cycles), rate (cycles per epoch), v, a, tau^ (chips), code rate (chips per epoch).
+    state : float64 (5,)
+        theta^ (cycles), rate (cycles per epoch), v, a, tau^ (chips).
     epoch0 : int
         First epoch of the block; arrays below are those of the whole block of E epochs.
     steered, steer : bool, float64 (E, 3)
@@ -203,14 +198,14 @@ def closed_loop(
         One period.
     echo_gain, echo_chips : complex64, float64 (n_echo, E)
         Gain relative to the direct path, excess delay >= 0.
-    cws, cw_lines : float64 (n_cw, 6), int64 (n_cw, 3)
-        As ``line_sequence``; first k, number of lines, first row of ``vectors``.
+    cws, spans : float64 (n_cw, 6), float64 (n_cw, 4)
+        As ``cw_sequences``; centre and half width of f T, first row and number of rows of ``vectors``.
     vectors : complex64 (rows, K)
-        conj(c_k) e^{-2 pi i k d / L}.
-    slow_k, slow_row, slow : int64 (n,), int64 (n,), complex64 (n, E)
-        Lines with given open-loop sequences (narrow-band noise).
+        Chebyshev coefficients of each CW's tap vector, f T beyond the span is held at its edge.
+    slow_hz, slow_vectors, slow : float64 (n,), complex64 (n, K), complex64 (n, E)
+        Components with given open-loop sequences around a frequency (narrow-band noise).
     geometry : float64 (6,)
-        T (s), f_R (Hz), L (chips), code phase at t = 0 (chips), table points per chip, cycles per chip.
+        T (s), fc (Hz), L (chips), code phase at t = 0 (chips), table points per chip, cycles per chip.
     loop : float64 (10,)
         K1, K2, K3, K_code, chips per unit of the code discriminator, index of E, P, L, codes of the carrier
         and code discriminators.
@@ -226,10 +221,9 @@ def closed_loop(
     for e in range(lo, hi):
         if steered:
             state[0], state[1], state[4] = steer[e, 0], steer[e, 1] * integration_s, steer[e, 2]
-            state[5] = state[1] / geometry[5]
         z = corr[e]
         theta, tau = state[0], state[4]
-        freq, tau_rate = state[1] / integration_s, state[5] / integration_s
+        freq = state[1] / integration_s
         eps, th_e, f_e = truth[e, 2] - tau, truth[e, 0] - theta, truth[e, 1] - freq
         sign = signs[e]
         direct = _sinc(f_e * integration_s) * _cycles(th_e) * (1.0 if wiped else sign)
@@ -240,13 +234,11 @@ def closed_loop(
         jam_sign = sign if wiped else 1.0
         for j in range(cws.shape[0]):
             if cws[j, 4] <= half * integration_s < cws[j, 5]:
-                _add_lines(
-                    z, cws[j], cw_lines[j], vectors, geometry, half, theta, freq, tau, tau_rate, jam_sign
-                )
-        for j in range(slow_k.shape[0]):
-            a = np.complex64(jam_sign * slow[j, e] * _cycles(-theta - slow_k[j] * tau / geometry[2]))
+                _add_cw(z, cws[j], spans[j], vectors, geometry, half, theta, freq, tau, jam_sign)
+        for j in range(slow_hz.shape[0]):
+            a = np.complex64(jam_sign * slow[j, e] * _cycles(-theta - slow_hz[j] * tau / geometry[1]))
             for i in range(n_taps):
-                z[i] += a * vectors[slow_row[j], i]
+                z[i] += a * slow_vectors[j, i]
         p = z[i_p]
         code = loop[4] * code_error(int(loop[9]), zero, complex(z[i_e]), complex(p), complex(z[i_l]), zero)
         phase = carrier_error_cycles(int(loop[8]), float(p.real), float(p.imag))
@@ -276,7 +268,6 @@ def _advance(state, phase, code, loop, cycles_per_chip):
     step = 0.5 * (state[1] + rate)
     state[0] += step
     state[1] = rate
-    state[5] = rate / cycles_per_chip
     state[4] += step / cycles_per_chip + loop[3] * code
 
 
