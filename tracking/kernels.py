@@ -127,21 +127,15 @@ CHANNEL = np.dtype(
         ("second_q", "f8"),
         ("data_i", "f8"),
         ("data_q", "f8"),
-        # Smoothed moments and their counts.
-        ("noise_ema", "f8"),  # noise power of one sample
-        ("noise_n", "f8"),
-        ("p2_ema", "f8"),
-        ("i2_ema", "f8"),
-        ("i4_ema", "f8"),
-        ("moment_n", "f8"),
-        ("lock_diff", "f8"),
-        ("lock_sum", "f8"),
-        ("lock_el", "f8"),
-        ("lock_n", "f8"),
+        # Moments over the last one half to one window.
+        ("noise_sums", "f8", (2, 2)),  # |noise tap|^2 per sample, count: previous and present half window
+        ("moments", "f8", (2, 4)),  # I^2, Q^2, I^4, count
+        ("lock_sums", "f8", (2, 4)),  # I^2 - Q^2, I^2 + Q^2, |E|^2 + |L|^2, count
         ("el_ema", "f8"),
         ("el_n", "f8"),
         ("half_i", "f8"),
         ("half_q", "f8"),
+        ("half_p", "f8"),
         ("half_n", "f8"),
         ("bump_ve", "f8"),
         ("bump_p", "f8"),
@@ -504,10 +498,27 @@ def _search_data(hist):
 
 @njit(nogil=True)
 def _reset_moments(st):
-    st.p2_ema = st.i2_ema = st.i4_ema = st.moment_n = 0.0
-    st.lock_diff = st.lock_sum = st.lock_el = st.lock_n = 0.0
-    st.half_i = st.half_q = st.half_n = 0.0
+    st.moments[:] = 0.0
+    st.lock_sums[:] = 0.0
+    st.half_i = st.half_q = st.half_p = st.half_n = 0.0
     st.bump_ve = st.bump_p = st.bump_vl = st.bump_n = 0.0
+
+
+@njit(nogil=True)
+def _shift_window(sums, half):
+    """When the present half window is full, it becomes the previous one: nothing older than a window counts."""
+    last = sums.shape[1] - 1
+    if sums[1, last] >= half:
+        for k in range(last + 1):
+            sums[0, k] = sums[1, k]
+            sums[1, k] = 0.0
+
+
+@njit(nogil=True)
+def _noise_power(st):
+    """Noise power of one sample from the reference tap, and the number of code periods it rests on."""
+    n = st.noise_sums[0, 1] + st.noise_sums[1, 1]
+    return (st.noise_sums[0, 0] + st.noise_sums[1, 0]) / max(n, 1.0), n
 
 
 @njit(nogil=True)
@@ -624,8 +635,10 @@ def _bump_decision(st, ratio):
 @njit(nogil=True)
 def _begin(st, command, fs_hz):
     """Start an integration: apply steering, choose the number of code periods."""
-    st.steered = 0
-    if command.steered != 0 and st.next_sample >= np.int64(command.sample_index):
+    early = st.next_sample < np.int64(command.sample_index)
+    if command.steered != 0 and early and st.steered != 0:
+        pass  # the command before this one still holds: the NCO runs on with its rate
+    elif command.steered != 0 and not early:
         dt = (st.next_sample - np.int64(command.sample_index)) / fs_hz
         rate = command.doppler_rate_hz_s
         mean_doppler = command.doppler_hz + 0.5 * rate * dt
@@ -640,6 +653,7 @@ def _begin(st, command, fs_hz):
         st.steered = 1
     else:
         st.doppler_rate_hz_s = 0.0
+        st.steered = 0
     m = 1
     if st.state == STATE_LOCKED:
         m = st.m_settle if st.settling else st.m_track
@@ -666,18 +680,20 @@ def _pull_in_code(st, e, late, noise):
 
 @njit(nogil=True)
 def _smooth(st, p, e2l2, ve2, vl2, T_s):
-    """Running moments: plain means at first, exponential windows later."""
+    """Collect the moments of one integration."""
     i2, q2 = p.real * p.real, p.imag * p.imag
-    st.moment_n = min(st.moment_n + 1.0, max(20.0, st.cn0_window_s / T_s))
-    g = 1.0 / st.moment_n
-    st.p2_ema += (i2 + q2 - st.p2_ema) * g
-    st.i2_ema += (i2 - st.i2_ema) * g
-    st.i4_ema += (i2 * i2 - st.i4_ema) * g
-    st.lock_n = min(st.lock_n + 1.0, max(5.0, 0.25 / T_s))
-    g = 1.0 / st.lock_n
-    st.lock_diff += (i2 - q2 - st.lock_diff) * g
-    st.lock_sum += (i2 + q2 - st.lock_sum) * g
-    st.lock_el += (e2l2 - st.lock_el) * g
+    _shift_window(st.moments, max(4.0, 0.5 * st.cn0_window_s / T_s))
+    m = st.moments[1]
+    m[0] += i2
+    m[1] += q2
+    m[2] += i2 * i2
+    m[3] += 1.0
+    _shift_window(st.lock_sums, max(3.0, 0.125 / T_s))
+    m = st.lock_sums[1]
+    m[0] += i2 - q2
+    m[1] += i2 + q2
+    m[2] += e2l2
+    m[3] += 1.0
     st.bump_ve += ve2
     st.bump_p += i2 + q2
     st.bump_vl += vl2
@@ -685,15 +701,24 @@ def _smooth(st, p, e2l2, ve2, vl2, T_s):
 
 
 @njit(nogil=True)
+def _estimate_cn0(st, T_s, fs_hz):
+    m = st.moments
+    n = m[0, 3] + m[1, 3]
+    i2, q2, i4 = (m[0, 0] + m[1, 0]) / n, (m[0, 1] + m[1, 1]) / n, (m[0, 2] + m[1, 2]) / n
+    noise, n_noise = _noise_power(st)
+    st.cn0_dbhz = cn0_noise_reference_dbhz(i2 + q2, st.n_acc, noise, n_noise, fs_hz)
+    st.cn0_prompt_dbhz = cn0_moments_dbhz(i2, i4, n, T_s)
+
+
+@njit(nogil=True)
 def _update_lock(st, noise, T_s, fs_hz, phase_error):
     """C/N0, lock indicators with hysteresis, cycle-slip flag. Returns the flag."""
-    n = st.n_acc
-    # An exponential window of gain g has the variance of 2 / g - 1 independent values.
-    n_noise = 2.0 * st.noise_n - 1.0
-    st.cn0_dbhz = cn0_noise_reference_dbhz(st.p2_ema, n, st.noise_ema, n_noise, fs_hz)
-    st.cn0_prompt_dbhz = cn0_moments_dbhz(st.i2_ema, st.i4_ema, 2.0 * st.moment_n - 1.0, T_s)
-    st.carrier_lock = carrier_lock(st.lock_diff, st.lock_sum, noise)
-    st.code_lock = code_lock(st.lock_el, st.lock_sum, noise, st.r_half)
+    _estimate_cn0(st, T_s, fs_hz)
+    m = st.lock_sums
+    n = m[0, 3] + m[1, 3]
+    power = (m[0, 1] + m[1, 1]) / n
+    st.carrier_lock = carrier_lock((m[0, 0] + m[1, 0]) / n, power, noise)
+    st.code_lock = code_lock((m[0, 2] + m[1, 2]) / n, power, noise, st.r_half)
     slip = 0
     if st.phase_locked:
         if st.carrier_lock < st.lock_out:
@@ -701,14 +726,12 @@ def _update_lock(st, noise, T_s, fs_hz, phase_error):
             slip = 1
         elif abs(phase_error) > (0.4 if st.carrier_code == FOUR_QUADRANT else 0.2):
             slip = 1
-    elif st.carrier_lock > st.lock_in and st.lock_n * T_s >= 0.1 and st.lock_n >= 5.0:
+    elif st.carrier_lock > st.lock_in and n * T_s >= 0.1 and n >= 4.0:
         st.phase_locked = 1
         st.lock_start_sample = st.next_sample
-    bad = st.carrier_lock < st.lock_out or st.cn0_dbhz < st.cn0_min_dbhz
-    if bad and (st.lock_n >= 5.0):
-        st.bad_s += T_s
-    else:
-        st.bad_s = max(0.0, st.bad_s - T_s)
+    if n >= 4.0:  # young averages do not count either way
+        bad = st.carrier_lock < st.lock_out or st.cn0_dbhz < st.cn0_min_dbhz
+        st.bad_s = st.bad_s + T_s if bad else max(0.0, st.bad_s - T_s)
     if st.bad_s > st.lost_after_s and st.steered == 0:
         st.state = STATE_LOST
         st.phase_locked = 0
@@ -718,15 +741,20 @@ def _update_lock(st, noise, T_s, fs_hz, phase_error):
 
 @njit(nogil=True)
 def _false_frequency(st, i1, q1, i2, q2, T_s):
-    """A Costas loop also settles at multiples of 1 / (2 T): the halves of the integration show it; jump back."""
-    st.half_n = min(st.half_n + 1.0, max(10.0, 0.3 / T_s))
-    g = 1.0 / st.half_n
-    st.half_i += (i1 * i2 + q1 * q2 - st.half_i) * g
-    st.half_q += (i1 * q2 - i2 * q1 - st.half_q) * g
-    if st.half_n < 10.0 or st.steered != 0:
+    """A Costas loop also settles at multiples of 1 / (2 T): the halves of the integration show it; jump back.
+
+    The mean product of halves must hold 0.6 of what a noise-free signal at that alias gives, over 0.3 s.
+    """
+    st.half_i += i1 * i2 + q1 * q2
+    st.half_q += i1 * q2 - i2 * q1
+    st.half_p += i1 * i1 + q1 * q1 + i2 * i2 + q2 * q2
+    st.half_n += 1.0
+    if st.half_n < max(10.0, 0.3 / T_s):
         return False
-    f = math.atan2(st.half_q, st.half_i) / (_TWO_PI * 0.5 * T_s)
-    if abs(f) < 0.3 / T_s or math.hypot(st.half_i, st.half_q) < 0.1 * st.lock_sum:
+    re, im, whole = st.half_i, st.half_q, st.half_p
+    st.half_i = st.half_q = st.half_p = st.half_n = 0.0
+    f = math.atan2(im, re) / (_TWO_PI * 0.5 * T_s)
+    if st.steered != 0 or abs(f) < 0.3 / T_s or math.hypot(re, im) < 0.3 * whole:
         return False
     st.rate_hz += f
     st.doppler_hz = st.rate_hz
@@ -769,7 +797,7 @@ def _finish(st, acc, hist, secondary, fs_hz, epoch, corr):
     i2, q2 = st.second_i * norm, st.second_q * norm
     i1, q1 = p.real - i2, p.imag - q2
     rounding = st.rounding_sum / n
-    noise = st.noise_ema / n
+    noise = _noise_power(st)[0] / n
     state = st.state
     phase_error = carrier_error_cycles(st.carrier_code, p.real, p.imag)
     freq_error = frequency_error_hz(i1, q1, i2, q2, 0.5 * T_s)
@@ -797,12 +825,13 @@ def _finish(st, acc, hist, secondary, fs_hz, epoch, corr):
         st.locked_time_s += T_s
         if st.settling and st.locked_time_s > st.settle_s and st.phase_locked:
             st.settling = 0
-            _reset_moments(st)
+            if st.m_settle != st.m_track:
+                _reset_moments(st)
     else:
         code_err = _pull_in_code(st, e, late, noise) + rounding
         if st.steered == 0:
             st.code_phase_chips += st.dll_pull * code_err
-        st.cn0_dbhz = cn0_noise_reference_dbhz(st.p2_ema, n, st.noise_ema, 2.0 * st.noise_n - 1.0, fs_hz)
+        _estimate_cn0(st, T_s, fs_hz)
         if st.hist_n == 0:
             st.hist_period = st.start_period
         if st.kind == KIND_CA:
@@ -887,8 +916,9 @@ def _accumulate(st, acc, sums, n, sign):
         st.data_i += sums[2 * st.n_taps + 2]
         st.data_q += sums[2 * st.n_taps + 3]
     noise_i, noise_q = sums[2 * st.n_taps] * st.scale, sums[2 * st.n_taps + 1] * st.scale
-    st.noise_n = min(st.noise_n + 1.0, st.cn0_window_s / st.period_s)
-    st.noise_ema += ((noise_i * noise_i + noise_q * noise_q) / n - st.noise_ema) / st.noise_n
+    _shift_window(st.noise_sums, max(4.0, 0.5 * st.cn0_window_s / st.period_s))
+    st.noise_sums[1, 0] += (noise_i * noise_i + noise_q * noise_q) / n
+    st.noise_sums[1, 1] += 1.0
     if 2 * st.m_done + 1 == st.m_total:
         st.second_i += sign * sums[2 * n_sums]
         st.second_q += sign * sums[2 * n_sums + 1]
