@@ -1,0 +1,308 @@
+"""Speed of this machine's receiver and generator: ``gnssbb bench``.
+
+Absolute rates drift with the machine and its other work. What is comparable are the ratios to a fixed plain kernel (one
+fused loop with look-up tables for carrier and code) taken in turn, A-B-A-B, in the same run: both see the same clock
+and the same neighbours. Every figure is a median over rounds of thread CPU time, except where wall time is named.
+"""
+
+import math
+import multiprocessing
+import tempfile
+import time
+from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numba as nb
+import numpy as np
+
+from sdr import iffile, scenario
+from sdr.receiver import Receiver
+from signals.source import SyntheticSource
+from tracking.acquisition import AcquisitionSpec, acquire, slab_samples
+from tracking.channel import TrackingSpec
+from tracking.records import ACQUISITION
+
+FS_HZ = 4.0e6
+LUT = 1024
+ROUNDS = 5
+SKY = """
+name = "bench"
+seed = 7
+duration_s = {duration_s}
+[sky]
+start = 2024-03-01T12:01:00
+signals = {signals}
+max_satellites = {satellites}
+cn0_dbhz = 47.0
+[front_end]
+fs_hz = {fs_hz}
+bits = 8
+[receiver.acquisition]
+systems = {systems}
+{receiver}
+"""
+
+
+@nb.njit(nogil=True, fastmath={"nsz", "arcp", "contract", "afn", "reassoc"})
+def plain_kernel(iq, code, n, carrier_step, code_step, cos_table, sin_table, out):
+    """The fixed reference: early, prompt and late in one loop, carrier and code by look-up, nothing clever."""
+    phase = 0.0
+    chip = 0.5
+    sums = np.zeros(6, np.float32)
+    for k in range(n):
+        j = np.int64(phase * LUT) & (LUT - 1)
+        i_in, q_in = np.float32(iq[0, k]), np.float32(iq[1, k])
+        c, s = cos_table[j], sin_table[j]
+        wi = i_in * c + q_in * s
+        wq = q_in * c - i_in * s
+        for t in range(3):
+            value = code[np.int64(chip + 0.25 * t)]
+            sums[2 * t] += wi * value
+            sums[2 * t + 1] += wq * value
+        phase += carrier_step
+        chip += code_step
+    out[:] = sums
+
+
+def bench(*, quick: bool = False, quiet: bool = False) -> dict[str, Any]:
+    """Measure; returns the JSON object of the ``bench`` command."""
+    rounds = 2 if quick else ROUNDS
+    say = (lambda _: None) if quiet else (lambda line: print(line, flush=True))
+    say(f"{cpu_name()}: rates per core, medians of {rounds} rounds in turn with the plain kernel")
+    plain = _plain()
+    iq = _sky(1.0, 8, ["L1CA"]).read(round(FS_HZ))[1]
+    one, one_ratio = _in_turn(_channel(iq, None), plain, rounds)
+    wide, wide_ratio = _in_turn(_channel(iq, 35), plain, rounds)
+    pilot, pilot_ratio = _galileo(plain, rounds)
+    say(f"  one channel E/P/L     {one / 1e9:6.2f} Gsample/s   {one_ratio:5.1f} times the plain kernel")
+    say(f"  one channel 35 taps   {wide / 1e9:6.2f} Gsample/s   {wide_ratio:5.1f}")
+    say(f"  E1 data + pilot       {pilot / 1e9:6.2f} Gsample/s   costs {one / pilot:.2f} C/A channels")
+    synth, synth_ratio = _in_turn(_synthesis(["L1CA"], 10), plain, rounds)
+    cboc = _median([_rate(_synthesis(["E1"], 8)) for _ in range(rounds)])
+    say(
+        f"  synthesis, 10 sat     {synth / 1e6:6.0f} satellite*Msps   {synth_ratio:5.1f}; CBOC {cboc / 1e6:.0f} component*Msps"
+    )
+    found_s = _median([_acquisition() for _ in range(rounds)])
+    say(f"  acquisition 32 PRN    {found_s:6.3f} s")
+    chain, compute = _chain(20.0 if quick else 60.0)
+    say(
+        f"  whole chain, 8 ch     {chain / 1e6:6.0f} channel*Msps, file to position ({compute:.1f} times real time)"
+    )
+    speedup = _median([_threads() for _ in range(rounds)])
+    say(f"  2 threads             {speedup:6.2f} of two independent processes")
+    return {
+        "track_channel_msps_per_core": chain / 1e6,
+        "track_one_channel_gsps": one / 1e9,
+        "track_35_taps_gsps": wide / 1e9,
+        "track_e1_pilot_data_cost": one / pilot,
+        "synth_satellite_msps_per_core": synth / 1e6,
+        "synth_cboc_component_cost": (synth / cboc),
+        "acquire_32_prn_s": found_s,
+        "threads_2_speedup": speedup,
+        "ratio_to_reference": {
+            "track_e_p_l": one_ratio,
+            "track_35_taps": wide_ratio,
+            "track_e1_pilot_data": pilot_ratio,
+            "synth": synth_ratio,
+        },
+        "real_time_factor_8_channels": compute,
+        "cpu": cpu_name(),
+        "text": "",
+    }
+
+
+def cpu_name() -> str:
+    """Model name of the processor."""
+    try:
+        text = Path("/proc/cpuinfo").read_text(encoding="utf-8")
+    except OSError:
+        import platform
+
+        return platform.processor() or platform.machine()
+    return next(
+        (line.split(":", 1)[1].strip() for line in text.splitlines() if line.startswith("model name")),
+        "unknown",
+    )
+
+
+Job = Callable[[], float]
+"""Does its work once and returns the samples (times channels or satellites) it handled."""
+
+
+def _rate(job: Job) -> float:
+    begin = time.thread_time()
+    done = job()
+    return done / (time.thread_time() - begin)
+
+
+def _in_turn(job: Job, plain: Job, rounds: int) -> tuple[float, float]:
+    """Median rate of ``job`` and median of its ratios to ``plain``, run in turn."""
+    job(), plain()
+    pairs = [(_rate(job), _rate(plain)) for _ in range(rounds)]
+    return _median([a for a, _ in pairs]), _median([a / b for a, b in pairs])
+
+
+def _median(values: list[float]) -> float:
+    return float(np.median(values))
+
+
+def _plain() -> Job:
+    rng = np.random.default_rng(1)
+    n = 4_000_000
+    iq = np.clip(np.round(20 * rng.standard_normal((2, n))), -127, 127).astype(np.int8)
+    code = np.where(rng.random(n // 3 + 8) < 0.5, -1, 1).astype(np.float32)
+    angle = 2 * math.pi * np.arange(LUT) / LUT
+    cos_table, sin_table = np.cos(angle).astype(np.float32), np.sin(angle).astype(np.float32)
+    out = np.zeros(6, np.float32)
+
+    def job() -> float:
+        plain_kernel(iq, code, n, 1234.5 / FS_HZ, 1.023e6 / FS_HZ, cos_table, sin_table, out)
+        return float(n)
+
+    return job
+
+
+def _channel(iq: np.ndarray, taps: int | None) -> Job:
+    """One C/A channel, all its loops, over one second of int8 samples."""
+    window = {"count": taps, "spacing_chips": 0.65} if taps else None
+    spec = TrackingSpec.model_validate({"l1ca": {"taps": window}})
+    row = acquire(iq[:, : slab_samples("L1CA", FS_HZ)], 0, FS_HZ, 0.0, "L1CA", None, AcquisitionSpec())
+    row = row[row["acquired"]][0]
+    slab = round(0.1 * FS_HZ)
+
+    def job() -> float:
+        tracker = spec.start(FS_HZ)
+        tracker.add(row)
+        for n0 in range(0, iq.shape[1], slab):
+            tracker.process(n0, iq[:, n0 : n0 + slab])
+        return float(iq.shape[1])
+
+    return job
+
+
+def _galileo(plain: Job, rounds: int) -> tuple[float, float]:
+    iq = _sky(1.0, 4, ["E1"]).read(round(FS_HZ))[1]
+    rows = acquire(iq[:, : slab_samples("E1C", FS_HZ)], 0, FS_HZ, 0.0, "E1C", None, AcquisitionSpec())
+    row = rows[rows["acquired"]][0]
+    spec = TrackingSpec.model_validate({"e1": {"side_peak_protection": False}})
+    slab = round(0.1 * FS_HZ)
+
+    def job() -> float:
+        tracker = spec.start(FS_HZ)
+        tracker.add(row)
+        for n0 in range(0, iq.shape[1], slab):
+            tracker.process(n0, iq[:, n0 : n0 + slab])
+        return float(iq.shape[1])
+
+    return _in_turn(job, plain, rounds)
+
+
+def _scenario(
+    duration_s: float, satellites: int, signals: list[str], receiver: str = ""
+) -> scenario.Scenario:
+    systems = [s for s, name in (("G", "L1CA"), ("E", "E1")) if name in signals]
+    text = SKY.format(
+        duration_s=duration_s,
+        satellites=satellites,
+        signals=signals,
+        systems=systems,
+        fs_hz=FS_HZ,
+        receiver=receiver,
+    )
+    return scenario.parse(text, "bench")
+
+
+def _sky(duration_s: float, satellites: int, signals: list[str]) -> SyntheticSource:
+    return scenario.source(_scenario(duration_s, satellites, signals))
+
+
+def _synthesis(signals: list[str], satellites: int) -> Job:
+    def job() -> float:
+        source = _sky(2.0, satellites, signals)
+        source.read(round(0.1 * FS_HZ))
+        while source.read(round(0.1 * FS_HZ))[1].shape[1]:
+            pass
+        return float(source.n_samples * len(source.sky.satellites) * (2 if "E1" in signals else 1))
+
+    return job
+
+
+def _acquisition() -> float:
+    """Seconds of CPU for 32 PRN, +-5 kHz, 10 x 1 ms at 4.096 Msps, the search alone."""
+    fs_hz = 4.096e6
+    rng = np.random.default_rng(3)
+    iq = np.clip(np.round(20 * rng.standard_normal((2, round(0.010 * fs_hz)))), -127, 127).astype(np.int8)
+    spec = AcquisitionSpec(non_coherent=10)
+    begin = time.thread_time()
+    acquire(iq, 0, fs_hz, 0.0, "L1CA", list(range(1, 33)), spec)
+    return time.thread_time() - begin
+
+
+def _chain(duration_s: float) -> tuple[float, float]:
+    """File to position: channel samples per second of CPU, and the real-time factor of the whole run."""
+    spec = _scenario(duration_s, 8, ["L1CA"])
+    with tempfile.TemporaryDirectory() as folder:
+        base = Path(folder) / "bench"
+        source = scenario.source(spec, threads=2)
+        with iffile.create_recording(base, source, spec) as writer:
+            while (iq := source.read(round(0.1 * FS_HZ))[1]).shape[1]:
+                writer.write(iq)
+        meta = next(p for p in writer.files if str(p).endswith(".sigmf-meta"))
+        for k in range(2):  # the first compiles
+            opened = iffile.open_recording(meta, iffile.declaration(meta))
+            receiver = Receiver(spec.receiver, opened)
+            begin, samples = time.process_time(), 0.0
+            for outcome in receiver:
+                samples += len(receiver.channel_of) * (outcome.n_end - outcome.n0)
+                if k == 0 and outcome.n_end > 2 * FS_HZ:
+                    break
+            elapsed = time.process_time() - begin
+    return samples / elapsed, duration_s / elapsed
+
+
+def _work(n_slabs: int, threads: int) -> None:
+    slab = _noise_slab()
+    spec = TrackingSpec.model_validate({"threads": threads})
+    tracker = spec.start(FS_HZ)
+    for prn in range(1, 9):
+        row = np.zeros((), ACQUISITION)
+        row["signal"], row["prn"], row["doppler_hz"] = b"L1CA", prn, 100.0 * prn
+        tracker.add(row)
+    tracker.channels["lost_after_s"] = 1e9
+    n = slab.shape[1]
+    for k in range(n_slabs):
+        tracker.process(k * n, slab)
+
+
+@lru_cache(maxsize=1)
+def _noise_slab() -> np.ndarray:
+    """(2, 0.1 s) int8 of noise."""
+    rng = np.random.default_rng(5)
+    return np.clip(np.round(20 * rng.standard_normal((2, round(0.1 * FS_HZ)))), -127, 127).astype(np.int8)
+
+
+def _worker(barrier: Any, queue: Any) -> None:
+    _work(2, 1)
+    barrier.wait()
+    begin = time.perf_counter()
+    _work(40, 1)
+    queue.put(time.perf_counter() - begin)
+
+
+def _threads() -> float:
+    """Throughput of two threads over that of two independent single-thread processes, wall time."""
+    _work(2, 2)
+    begin = time.perf_counter()
+    _work(80, 2)
+    together = time.perf_counter() - begin
+    context = multiprocessing.get_context("spawn")
+    barrier, queue = context.Barrier(2), context.Queue()
+    workers = [context.Process(target=_worker, args=(barrier, queue)) for _ in range(2)]
+    for w in workers:
+        w.start()
+    apart = max(queue.get(timeout=300) for _ in workers)
+    for w in workers:
+        w.join()
+    return apart / together
