@@ -210,10 +210,10 @@ class Navigator:
     def _klobuchar(self, iono_utc_gps):
         if self.spec.iono == "none":
             return None
-        if iono_utc_gps is None:
-            self.notes.append("ionosphere not corrected: its parameters are not decoded yet")
+        row = None if iono_utc_gps is None else np.atleast_1d(iono_utc_gps)[0]
+        if row is None or not row["beta"].any():  # a row may hold other parameters than these
+            self.notes.append("ionosphere not corrected: its GPS parameters are not decoded yet")
             return None
-        row = np.atleast_1d(iono_utc_gps)[0]
         return row["alpha"], row["beta"]
 
     def _second(self, obs, eph, iono_utc_galileo):
@@ -225,8 +225,8 @@ class Navigator:
         galileo = obs["system"] == b"E"
         none = np.zeros(obs.size)
         if self.spec.isb == "ggto":
-            if iono_utc_galileo is not None:
-                row = np.atleast_1d(iono_utc_galileo)[0]
+            row = None if iono_utc_galileo is None else np.atleast_1d(iono_utc_galileo)[0]
+            if row is not None and any(row[f] for f in ("a0g_s", "a1g_s_s", "t0g_s", "week_0g")):
                 ggto_m = pvt.ggto_m(row, float(obs["tow_tx_s"][0]), self._week(eph))
                 return none, galileo * ggto_m, False
             self.notes.append("GGTO not decoded yet: inter-system bias estimated")

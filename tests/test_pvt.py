@@ -60,6 +60,16 @@ def test_broadcast_ggto_replaces_the_estimated_bias():
         assert row["tow_s"] == pytest.approx(sky.tow_s + 30.0, abs=3e-10) and np.isnan(row["isb_m"])
 
 
+def test_parameters_not_decoded_are_left_out_and_said():
+    sky = make_sky()
+    empty = np.zeros((), sky.iono_utc.dtype)
+    for iono in (None, empty):
+        nav = NavigationSpec(isb="ggto").start(FS_HZ)
+        row = nav.update(transmit(sky, 30.0), ephemerides(sky), iono, iono)
+        assert len(nav.notes) == 2 and "ionosphere" in nav.notes[1] and "GGTO" in nav.notes[0]
+        assert 0.5 < np.linalg.norm(_error(sky, row)[0]) < 30.0 and row["isb_m"] == pytest.approx(-1.5, abs=1.0)
+
+
 def test_predicted_range_is_the_inertial_light_time():
     """Independent twin: put satellite and receiver in an inertial frame and iterate the light time there."""
     rng = np.random.default_rng(3)
@@ -240,7 +250,7 @@ def test_degenerate_geometry_is_refused_not_solved():
 
 def test_held_bias_lets_two_and_two_satellites_fix():
     sky = make_sky()
-    nav = NavigationSpec(smoothing_s=0).start(FS_HZ)
+    nav = NavigationSpec(smoothing_s=0, gdop_max=1e4).start(FS_HZ)
     eph = ephemerides(sky)
     nav.update(transmit(sky, 30.0), eph, sky.iono_utc)
     rows = transmit(sky, 31.0)
