@@ -96,7 +96,7 @@ def simulate(
     errors: RangeErrors | None = None,
     baro_var_ft2: float = BARO_VAR_FT2,
 ) -> Outcome:
-    """Run a batch. ``fault_ft`` (T,) on the first satellite, ``sigma_ft`` (T, m); ``adapt`` False = R fixed at 9 ft^2.
+    """Run a batch. ``fault_ft`` (T,) on the first satellite, ``sigma_ft`` (T, m); ``adapt`` False = R fixed at 9 ft^2 + R0.
 
     ``single`` replaces the bank by one filter that uses and tests every satellite (Figures 9 and 13); ``errors`` adds the
     truth model of appendix B, which no filter knows.
@@ -136,7 +136,7 @@ def simulate(
         parts = [a[lo : lo + b] for a in out[1:]] if lo < traced else [empty] * 3 + [
             np.zeros((0, 0, n)), np.zeros((0, 0, n, n)), np.zeros((0, 0, m))
         ]  # fmt: skip
-        fixed = 0.0 if adapt else (SIGMA_FT * FOOT_M) ** 2
+        fixed = 0.0 if adapt else (SIGMA_FT * FOOT_M) ** 2 + bank.r0_m2
         pf.monte_carlo(
             x0, noise, v, v2, sigma * FOOT_M, np.asarray(fault_ft) * FOOT_M, 0, baro, s.phi, s.qd, s.h, s.baro_h,
             np.array([baro_var_ft2 * FOOT_M**2]), s.p0, *layout, limits, T_WARM if detect else T_END + 1, ints,
