@@ -47,7 +47,7 @@ __all__ = [
 _COMPONENTS = {"L1CA": ("L1CA",), "E1B": ("E1B",), "E1C": ("E1B", "E1C")}
 _REPLICA = {"L1CA": "BPSK", "E1B": "BOC11", "E1C": "BOC11"}
 _BEST_HZ = {"L1CA": 4.096e6, "E1B": 4.0e6, "E1C": 4.0e6}  # 4096 and 2 x 16000 samples: quick transforms
-_BLOCKS = {"L1CA": 10, "E1B": 8, "E1C": 4}  # default search: 10 ms, 36 ms, 20 ms
+_BLOCKS = {"L1CA": 10, "E1B": 6, "E1C": 3}  # default search: 10 ms, 28 ms, 16 ms
 _WINDOW_PERIODS = {"L1CA": 4, "E1B": 1, "E1C": 1}  # 4 ms: verification, refinement of the Doppler
 _PIECES_PER_MS = 4
 _WEAK_DB = (
@@ -75,7 +75,7 @@ class AcquisitionSpec(BaseModel):
     coherent_ms: int | None = Field(None, ge=1, le=20)
     """L1CA: 1-20, default 1 (a data bit changes every 20 ms at most). E1: 4 alone."""
     non_coherent: int | None = Field(None, ge=1, le=1000)
-    """Blocks summed in power. Default: 10 ms (L1CA) or 20 ms (E1), then verification in 40 ms more."""
+    """Blocks summed in power. Default: 10 ms (L1CA), 28 ms (E1B) or 16 ms (E1C), then verification in 40 ms more."""
     p_fa: float = Field(1e-4, gt=0, lt=1)
     """Probability that the search of one PRN without a signal reports one, over the whole search space."""
     excise_tones: bool = True
@@ -481,6 +481,8 @@ def _refine(follower, doppler_hz, lag):
     for _ in range(2):
         doppler_hz = _refine_doppler(follower, doppler_hz, lag, offset, periods, stop)
         offset = _refine_code(follower, doppler_hz, lag, periods, stop)
+    if plan.pad == 2:
+        doppler_hz += _across_periods_hz(follower.pieces(doppler_hz, lag, offset, stop))
     noise, _ = _noise_powers(follower, doppler_hz, lag, 1, 8, stop)
     one, n_one = _window_power(follower.pieces(doppler_hz, lag, offset, stop), 1, 0.0)
     snr = one[0] / n_one / np.mean(noise) - 1
@@ -503,6 +505,13 @@ def _refine_doppler(follower, doppler_hz, lag, offset, periods, stop):
         residual_hz = np.arange(-n, n + 1) * step
     power, _ = _window_power(pieces, periods, residual_hz)
     return doppler_hz + _vertex(residual_hz, power)
+
+
+def _across_periods_hz(pieces):
+    """Residual Doppler from the phase between code periods, squared to remove symbols; within +-1 / (4 T) = 62 Hz."""
+    z = pieces.sum(axis=2)
+    squared = np.sum((z[:, 1:] * np.conj(z[:, :-1])) ** 2)
+    return float(np.angle(squared)) / (4 * np.pi * 4e-3) if squared != 0 else 0.0
 
 
 def _refine_code(follower, doppler_hz, lag, periods, stop):

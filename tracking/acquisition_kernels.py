@@ -26,38 +26,44 @@ def resample(xi, xq, taps, ratio, out):
         out[1, j] = im
 
 
-@nb.njit(cache=True, nogil=True, fastmath={"contract"})
+@nb.njit(cache=True, nogil=True, fastmath=True)
 def shifted_product(spectrum, shift, template, out):
-    """out[k] = spectrum[(k + shift) mod n] * template[k]; complex64 (n,), 0 <= shift < n."""
-    n = len(out)
-    for k in range(n - shift):
-        out[k] = spectrum[k + shift] * template[k]
-    for k in range(n - shift, n):
-        out[k] = spectrum[k + shift - n] * template[k]
+    """out[k] = spectrum[(k + shift) mod n] * template[k]; complex64 (n,), 0 <= shift < n, all finite."""
+    # Unsigned indices: no test for negative ones, so that the loops become vector instructions.
+    n, s = np.uint64(len(out)), np.uint64(shift)
+    for k in range(n - s):
+        out[k] = spectrum[k + s] * template[k]
+    for k in range(n - s, n):
+        out[k] = spectrum[k + s - n] * template[k]
 
 
-@nb.njit(cache=True, nogil=True, fastmath={"contract"})
+@nb.njit(cache=True, nogil=True, fastmath=True)
 def add_power(y, shift, acc):
-    """acc[i] += |y[(i - shift) mod n]|^2, n = len(acc) <= len(y), 0 <= shift < n."""
-    n = len(acc)
-    for i in range(shift):
-        v = y[i - shift + n]
-        acc[i] += v.real * v.real + v.imag * v.imag
-    for i in range(shift, n):
-        v = y[i - shift]
-        acc[i] += v.real * v.real + v.imag * v.imag
+    """acc[i] += |y[(i - shift) mod n]|^2, n = len(acc) <= len(y), 0 <= shift < n, all finite."""
+    n, s = np.uint64(len(acc)), np.uint64(shift)
+    for i in range(s):
+        re, im = y[i + n - s].real, y[i + n - s].imag
+        acc[i] += re * re + im * im
+    for i in range(s, n):
+        re, im = y[i - s].real, y[i - s].imag
+        acc[i] += re * re + im * im
 
 
 @nb.njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz", "nnan"})
 def row_peak(acc, guard):
     """(peak, its index, mean and standard deviation of the cells further than ``guard`` from it, circularly)."""
     n = len(acc)
-    total, square, peak = np.float32(0), np.float32(0), np.float32(0)
-    for i in range(n):
+    total, square, at = np.float32(0), np.float32(0), 0
+    for i in range(np.uint64(n)):
         total += acc[i]
         square += acc[i] * acc[i]
-        peak = max(peak, acc[i])
-    at = 0
+    peak = np.float32(0)
+    for first in range(0, n, 64):  # most blocks do not hold a new maximum
+        high = np.float32(0)
+        for i in range(np.uint64(first), np.uint64(min(first + 64, n))):
+            high = max(high, acc[i])
+        if high > peak:
+            peak, at = high, first
     while acc[at] != peak:
         at += 1
     near, near_square = 0.0, 0.0
@@ -73,21 +79,23 @@ def row_peak(acc, guard):
 def rotate(x, cycles_per_sample, out):
     """out = x exp(-2 pi i f n), planar float32 (2, n); the phase is exact at every 256th sample."""
     step = np.exp(-2j * np.pi * cycles_per_sample)
-    table = np.empty((2, 256), np.float32)
+    cosine, sine = np.empty(256, np.float32), np.empty(256, np.float32)
     w = 1.0 + 0.0j
     for k in range(256):
-        table[0, k], table[1, k] = w.real, w.imag
+        cosine[k], sine[k] = w.real, w.imag
         w *= step
     n = x.shape[1]
+    xi, xq, yi, yq = x[0], x[1], out[0], out[1]
     for first in range(0, n, 256):
         turn = (cycles_per_sample * first) % 1.0
         c, s = np.float32(np.cos(2 * np.pi * turn)), np.float32(-np.sin(2 * np.pi * turn))
-        for k in range(min(256, n - first)):
-            re = c * table[0, k] - s * table[1, k]
-            im = c * table[1, k] + s * table[0, k]
-            a, b = x[0, first + k], x[1, first + k]
-            out[0, first + k] = a * re - b * im
-            out[1, first + k] = a * im + b * re
+        at = np.uint64(first)
+        for k in range(np.uint64(min(256, n - first))):
+            re = c * cosine[k] - s * sine[k]
+            im = c * sine[k] + s * cosine[k]
+            a, b = xi[at + k], xq[at + k]
+            yi[at + k] = a * re - b * im
+            yq[at + k] = a * im + b * re
 
 
 @nb.njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"})
@@ -98,6 +106,7 @@ def piece_sums(x, table, samples_per_chip, length, phase_chips, chips_per_sample
     piece p covers samples round(first + p piece) .. round(first + (p + 1) piece); ``out`` complex128 (pieces,).
     """
     n_phase = table.shape[0]
+    xi, xq = x[0], x[1]
     for p in range(len(out)):
         lo, hi = int(first + p * piece + 0.5), int(first + (p + 1) * piece + 0.5)
         phase = (phase_chips + lo * chips_per_sample) % length
@@ -105,10 +114,11 @@ def piece_sums(x, table, samples_per_chip, length, phase_chips, chips_per_sample
         row = table[q % n_phase]
         column = q // n_phase
         re, im = np.float32(0), np.float32(0)
-        for k in range(hi - lo):
-            c = np.float32(row[column + k])
-            re += c * x[0, lo + k]
-            im += c * x[1, lo + k]
+        a, b = np.uint64(lo), np.uint64(column)
+        for k in range(np.uint64(hi - lo)):
+            c = np.float32(row[b + k])
+            re += c * xi[a + k]
+            im += c * xq[a + k]
         out[p] = complex(re, im)
 
 
