@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from nav.errormodels import Ecef17
 from nav.frames import gravity_ecef
 from nav.records import IMU, ODOMETER
 from signals.attitude import attitude, specific_force_ecef
@@ -122,6 +123,24 @@ class OdometerSpec(BaseModel):
     noise_mps: Annotated[float, Field(ge=0, le=10)] = 0.01
     scale_sigma: Annotated[float, Field(ge=0, le=0.2)] = 0.01
     scale_tau_s: Annotated[float, Field(gt=0)] = 3600.0
+
+
+def ecef17_of(imu: ImuSpec, **other) -> Ecef17:
+    """The 17-state error model whose noise is that of an IMU; ``other`` sets the clock's densities.
+
+    Gauss-Markov biases: driving noise sqrt(2/tau) sigma. With a turn-on bias beside it the sum neither decays nor
+    forgets, so it is modelled as a random walk of that noise and its turn-on size belongs in P0. Scale factor and
+    misalignment have no state: enlarge the noise where they matter.
+    """
+    values = {
+        "accel_noise_mps2_rthz": imu.accel_noise_si,
+        "gyro_noise_rad_s_rthz": imu.gyro_noise_si,
+        "accel_bias_walk_mps2_rts": math.sqrt(2.0 / imu.accel_tau_s) * imu.accel_bias_si[1],
+        "gyro_bias_walk_rad_s_rts": math.sqrt(2.0 / imu.gyro_tau_s) * imu.gyro_bias_si[1],
+        "accel_bias_tau_s": imu.accel_tau_s if imu.accel_bias_mg == 0.0 else math.inf,
+        "gyro_bias_tau_s": imu.gyro_tau_s if imu.gyro_bias_deg_h == 0.0 else math.inf,
+    }
+    return Ecef17(**(values | other))
 
 
 def gauss_markov(rng, sigma, tau_s, dt_s, shape):
