@@ -286,9 +286,7 @@ def _fix(receiver: Receiver, source: Any, tally: _Tally) -> dict[str, Any] | Non
 
 def _why_no_fix(receiver: Receiver, duration_s: float, satellites: list[dict[str, Any]]) -> str:
     if not satellites:
-        searched = (
-            "; ".join(receiver.searched) or "nothing: the recording is shorter than one search, or all zeros"
-        )
+        searched = receiver.searched_text() or "nothing: the recording is shorter than one search, or all zeros"
         return f"no satellite was found; searched {searched}"
     locked = [s for s in satellites if s["locked_s"] > 0]
     with_ephemeris = [s for s in satellites if s["ephemeris"]]

@@ -22,8 +22,10 @@ from tracking.telemetry import Telemetry
 
 SEARCHED = {"G": "L1CA", "E": "E1C"}
 """Signal that is searched for each system; it also names the component that carries the loops."""
-REACQUIRE_HZ = 500.0
-"""Half width of the Doppler search for a satellite that was tracked a moment ago."""
+ENOUGH = 4
+"""Satellites tracked below which everything is searched again and again."""
+RETRY_S = 1.0
+"""A satellite that was lost is looked for again this soon."""
 
 
 class Source(Protocol):
@@ -62,11 +64,11 @@ class Receiver:
         self.telemetry = Telemetry(self.tracker)
         self.navigator = spec.navigation.start(source.fs_hz)
         self.channel_of: dict[tuple[str, int], int] = {}
-        self.last_doppler_hz: dict[tuple[str, int], float] = {}
-        self.searched: list[str] = []
+        self.searched: dict[str, list[int]] = {}
         self.position = 0
         self._recent: list[tuple[int, np.ndarray]] = []
-        self._next_search = 0
+        self._lost: list[tuple[str, int]] = []
+        self._next_search = self._next_retry = self._full_searches = self._turn = 0
         self._wanted = self._dwell_samples()
 
     def __iter__(self) -> Iterator[Outcome]:
@@ -108,52 +110,74 @@ class Receiver:
         return wanted
 
     def _search(self, n0: int, iq: np.ndarray) -> np.ndarray:
-        """Look for satellites that are not tracked, when enough samples are at hand and the time has come."""
-        lost = [
-            (key, c) for key, c in self.channel_of.items() if self.tracker.channels["state"][c] == STATE_LOST
-        ]
-        for key, c in lost:
-            self.tracker.release(c)
-            del self.channel_of[key]
-        if n0 + iq.shape[1] < self._next_search and not lost:
+        """Look for satellites that are not tracked, when the time has come and enough samples are at hand.
+
+        A search of everything costs as much as tracking for a minute or more. So all is searched at the start, once
+        more a little later, and every ``search_every_s`` while fewer than ``ENOUGH`` satellites are tracked; else
+        one satellite in turn every ``search_one_every_s``, those lost a moment ago first.
+        """
+        n_end = n0 + iq.shape[1]
+        self._drop_lost()
+        if n_end < self._next_search and not (self._lost and n_end >= self._next_retry):
             self._recent.clear()
             return np.empty(0, ACQUISITION)
         self._recent.append((n0, iq))
-        held = sum(s.shape[1] for _, s in self._recent)
-        at_end = n0 + iq.shape[1] >= self.source.n_samples
-        if held < self._wanted and not at_end:
+        if sum(s.shape[1] for _, s in self._recent) < self._wanted and n_end < self.source.n_samples:
             return np.empty(0, ACQUISITION)
         first, samples = self._recent[0][0], np.concatenate([s for _, s in self._recent], axis=1)
         self._recent.clear()
-        self._next_search = n0 + iq.shape[1] + round(self.spec.search_every_s * self.fs_hz)
-        return self._acquire_missing(first, samples)
+        self._next_retry = n_end + round(RETRY_S * self.fs_hz)
+        return self._acquire(first, samples, self._due(n_end))
 
-    def _acquire_missing(self, first: int, samples: np.ndarray) -> np.ndarray:
+    def _drop_lost(self) -> None:
+        for key, c in list(self.channel_of.items()):
+            if self.tracker.channels["state"][c] == STATE_LOST:
+                self.tracker.release(c)
+                del self.channel_of[key]
+                self._lost.append(key)
+
+    def _due(self, n_end: int) -> list[tuple[str, int]]:
+        """Satellites to search now."""
+        spec = self.spec.acquisition
+        prns = {"G": spec.gps_prns, "E": spec.galileo_prns}
+        missing = [
+            (SEARCHED[system], p)
+            for system in spec.systems
+            for p in prns[system]
+            if (SEARCHED[system], p) not in self.channel_of
+        ]
+        lost, self._lost = [key for key in self._lost if key in missing], []
+        if n_end < self._next_search:
+            return lost
+        self._full_searches += 1
+        if self._full_searches <= 2 or len(self.channel_of) < ENOUGH:
+            self._next_search = n_end + round(self.spec.search_every_s * self.fs_hz)
+            return missing
+        self._next_search = n_end + round(self.spec.search_one_every_s * self.fs_hz)
+        self._turn += 1
+        return lost + ([missing[self._turn % len(missing)]] if missing else [])
+
+    def _acquire(self, first: int, samples: np.ndarray, due: list[tuple[str, int]]) -> np.ndarray:
         spec = self.spec.acquisition
         found = []
-        self.searched = []
-        for system in spec.systems:
-            signal = SEARCHED[system]
-            prns = [
-                p
-                for p in (spec.gps_prns if system == "G" else spec.galileo_prns)
-                if (signal, p) not in self.channel_of
-            ]
-            if (
-                samples.shape[1] < 2 * SIGNALS[signal].code_period_s * self.fs_hz
-                or not prns
-                or not samples.any()
-            ):
+        for signal in dict.fromkeys(s for s, _ in due):
+            prns = [p for s, p in due if s == signal]
+            if samples.shape[1] < 2 * SIGNALS[signal].code_period_s * self.fs_hz or not samples.any():
                 continue
-            self.searched.append(
-                f"{signal} PRN {_ranges(prns)} within {spec.doppler_center_hz:+.0f} ± {spec.doppler_range_hz:.0f} Hz"
-            )
+            self.searched[signal] = sorted({*self.searched.get(signal, ()), *prns})
             rows = acquire(samples, first, self.fs_hz, self.source.if_hz, signal, prns, spec)
             for row in rows[rows["acquired"]]:
-                self.channel_of[signal, int(row["prn"])] = self.tracker.add(row)
-                self.telemetry.start(self.channel_of[signal, int(row["prn"])])
+                c = self.tracker.add(row)
+                self.channel_of[signal, int(row["prn"])] = c
+                self.telemetry.start(c)
                 found.append(row)
         return np.array(found, ACQUISITION)
+
+    def searched_text(self) -> str:
+        """What has been searched, for people."""
+        spec = self.spec.acquisition
+        span = f"within {spec.doppler_center_hz:+.0f} ± {spec.doppler_range_hz:.0f} Hz"
+        return "; ".join(f"{s} PRN {_ranges(p)} {span}" for s, p in self.searched.items())
 
     # -- navigation -------------------------------------------------------------------------------------------------
 

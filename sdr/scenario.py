@@ -38,7 +38,9 @@ class ReceiverSpec(BaseModel):
     slab_ms: Annotated[int, Field(ge=20, le=200, multiple_of=20)] = 100
     """Length of the slab of samples that passes through the loop at once."""
     search_every_s: Annotated[float, Field(gt=0)] = 5.0
-    """Satellites not yet tracked are searched again this often."""
+    """All satellites are searched again this often while too few are tracked."""
+    search_one_every_s: Annotated[float, Field(gt=0)] = 2.0
+    """Later, one satellite in turn is searched this often."""
 
 
 class Scenario(BaseModel):
