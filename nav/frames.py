@@ -120,7 +120,7 @@ def gravity_ecef(pos_ecef_m, g_out):
     """Gravity (gravitation of the J2 field + centrifugal acceleration) in ECEF into g_out (3,), m/s^2.
 
     gamma = -mu/r^3 (x (1 + k (1 - 5 s^2)), y (same), z (1 + k (3 - 5 s^2))), k = 1.5 J2 (a/r)^2, s = z/r
-    (Groves 2013, eq. 2.142), plus w_ie^2 (x, y, 0).
+    (Groves 2013, section 2.4.7), plus w_ie^2 (x, y, 0).
     """
     x, y, z = pos_ecef_m[0], pos_ecef_m[1], pos_ecef_m[2]
     r2 = x * x + y * y + z * z

@@ -128,9 +128,9 @@ class OdometerSpec(BaseModel):
 def ecef17_of(imu: ImuSpec, **other) -> Ecef17:
     """The 17-state error model whose noise is that of an IMU; ``other`` sets the clock's densities.
 
-    Gauss-Markov biases: driving noise sqrt(2/tau) sigma. With a turn-on bias beside it the sum neither decays nor
-    forgets, so it is modelled as a random walk of that noise and its turn-on size belongs in P0. Scale factor and
-    misalignment have no state: enlarge the noise where they matter.
+    Gauss-Markov biases: driving noise sqrt(2/tau) sigma. With a turn-on bias beside it the sum neither
+    decays nor forgets, so it is modelled as a random walk of that noise and its turn-on size belongs in
+    P0. Scale factor and misalignment have no state: enlarge the noise where they matter.
     """
     values = {
         "accel_noise_mps2_rthz": imu.accel_noise_si,
@@ -146,7 +146,8 @@ def ecef17_of(imu: ImuSpec, **other) -> Ecef17:
 def gauss_markov(rng, sigma, tau_s, dt_s, shape):
     """First-order Gauss-Markov sequence along axis 0, stationary from the start.
 
-    b_{k+1} = phi b_k + sqrt(sigma^2 (1 - phi^2)) w_k, phi = exp(-dt/tau) (Brown & Hwang 1992, eq. 2.9).
+    b_{k+1} = phi b_k + sqrt(sigma^2 (1 - phi^2)) w_k, phi = exp(-dt/tau) (Brown & Hwang 1992, first-order
+    Gauss-Markov).
     """
     from scipy.signal import lfilter
 

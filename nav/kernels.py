@@ -256,7 +256,7 @@ def pvt_predict(x, p, dt_s, accel_psd, clock_f, clock_g, isb_psd):
     caller).
 
     Position' = velocity, velocity' = white acceleration (PSD accel_psd, m^2/s^3, each ECEF axis); clock
-    two-state with S_f = clock_f (m^2/s) and S_g = clock_g (m^2/s^3) (Brown & Hwang 1992, section 10.3);
+    two-state with S_f = clock_f (m^2/s) and S_g = clock_g (m^2/s^3) (Brown & Hwang 1997, section 10.3);
     ISB random walk.
     """
     f = np.eye(N_EKF)

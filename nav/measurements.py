@@ -157,25 +157,34 @@ class Hatch:
         self._state = {}
 
     def smooth(self, obs):
-        """Fill ``pseudorange_smoothed_m`` in place. A slip, a lock younger than the last epoch or a gap
-        resets."""
+        """Fill ``pseudorange_smoothed_m`` in place; a slip, a lock younger than the last epoch or a gap
+        resets.
+
+        Returns
+        -------
+        (n,) variance of the smoothed range over that of the raw one for white code noise,
+        v_k = (1 - w)^2 v_{k-1} + w^2.
+        """
+        ratio = np.ones(obs.size)
         if self.window_s == 0.0:
-            return
-        for row in obs:
+            return ratio
+        for i, row in enumerate(obs):
             key = (bytes(row["signal"]), int(row["prn"]))
             sample = int(row["sample_index"])
             phase_m = WAVELENGTH_M * float(row["carrier_phase_cycles"])
             code_minus_carrier_m = float(row["pseudorange_m"]) + phase_m
-            mean, count, last = self._state.get(key, (0.0, 0, sample))
+            mean, count, last, v = self._state.get(key, (0.0, 0, sample, 1.0))
             dt_s = (sample - last) / self.fs_hz
             if row["cycle_slip"] or row["lock_s"] < dt_s * (1.0 - 1e-9) or dt_s > self.window_s:
                 count = 0
             count += 1
             weight = max(1.0 / count, min(1.0, dt_s / self.window_s))
             mean += weight * (code_minus_carrier_m - mean)
-            self._state[key] = (mean, count, sample)
+            ratio[i] = (1.0 - weight) ** 2 * v + weight**2
+            self._state[key] = (mean, count, sample, ratio[i])
             row["pseudorange_smoothed_m"] = mean - phase_m
+        return ratio
 
     def shift(self, step_m):
         """The receiver time was steered: every pseudorange moved by step_m."""
-        self._state = {k: (m + step_m, n, s) for k, (m, n, s) in self._state.items()}
+        self._state = {k: (m + step_m, *rest) for k, (m, *rest) in self._state.items()}

@@ -121,6 +121,7 @@ class Navigator:
         self.excluded: list[str] = []
         self.residual_m = np.zeros(0)
         self.innovations = np.zeros((0, 3))
+        self._smoothing = np.ones(0)
         self._steered_m = 0.0
         self._state = None  # (5,) last position, bias, ISB
         self._vel = np.zeros(3)
@@ -170,7 +171,7 @@ class Navigator:
         if timed.size and not self.clock.is_set:
             self.clock.set_from_transmit(timed)
         obs = observables(timed, self.clock)
-        self.hatch.smooth(obs)
+        smoothing = self.hatch.smooth(obs)
         newest = {(e["system"], int(e["prn"])): i for i, e in enumerate(ephemeris)}
         keep, index, dropped = [], [], []
         for i in np.argsort(-obs["cn0_dbhz"], kind="stable"):
@@ -189,6 +190,7 @@ class Navigator:
                 + (f" ({', '.join(undecoded + dropped)})." if undecoded or dropped else ".")
             )
         order = np.argsort(keep)
+        self._smoothing = smoothing[np.array(keep)[order]]
         return obs[np.array(keep)[order]], ephemeris[np.array(index)[order]]
 
     def _unfit(self, row, eph):
@@ -249,7 +251,11 @@ class Navigator:
 
     def _variance(self, obs, sats):
         return pvt.range_variance(
-            obs["cn0_dbhz"], sats["elevation_rad"], self.spec.sigma_code_m, self.spec.sigma_atmosphere_m
+            obs["cn0_dbhz"],
+            sats["elevation_rad"],
+            self.spec.sigma_code_m,
+            self.spec.sigma_atmosphere_m,
+            self._smoothing,
         )
 
     def _above_mask(self, sats):

@@ -144,15 +144,18 @@ def look(sats, pos_ecef_m, vel_ecef_mps, tow_s, klobuchar=None, troposphere=Fals
         sats[name] = out[:, column]
 
 
-def range_variance(cn0_dbhz, elevation_rad, sigma_45_m, sigma_zenith_m):
+def range_variance(cn0_dbhz, elevation_rad, sigma_45_m, sigma_zenith_m, smoothing=1.0):
     """Pseudorange variance, m^2: thermal noise at C/N0 plus what is left of the atmosphere at elevation.
 
-    sigma_45^2 10^((45 - C/N0)/10) + (sigma_zenith / sin el)^2, el at least 3 deg. Thermal code noise goes
-    with 1/(C/N0) (Betz & Kolodziejski 2009, eq. 25, squaring loss left out); mapping 1/sin el
-    (Hofmann-Wellenhof et al. 2008, 5.128).
+    smoothing sigma_45^2 10^((45 - C/N0)/10) + (sigma_zenith / sin el)^2, el at least 3 deg; ``smoothing``
+    is what carrier smoothing leaves of the noise variance. Thermal code noise goes with 1/(C/N0) (Kaplan &
+    Hegarty 2006, section 5.6.3, squaring loss left out); 1/sin el is the flat-Earth mapping.
     """
     sin_el = np.sin(np.maximum(elevation_rad, math.radians(3.0)))
-    return sigma_45_m**2 * 10.0 ** ((45.0 - np.asarray(cn0_dbhz)) / 10.0) + (sigma_zenith_m / sin_el) ** 2
+    return (
+        smoothing * sigma_45_m**2 * 10.0 ** ((45.0 - np.asarray(cn0_dbhz)) / 10.0)
+        + (sigma_zenith_m / sin_el) ** 2
+    )
 
 
 def rate_variance(cn0_dbhz, sigma_45_mps, sigma_floor_mps):
@@ -285,7 +288,7 @@ def raim(sats, corrected_m, variance, second, use, estimate_isb, p_fa, start=Non
 def ggto_m(iono_utc, tow_s, week):
     """c x (GST - GPS time) of Galileo word 10, m: A0G + A1G (TOW - t0G + 604800 (WN - WN0G mod 64)).
 
-    Galileo OS SIS ICD, 5.1.8 (eq. 19).
+    Galileo OS SIS ICD, section 5.1.8.
     """
     weeks = (int(week) - int(iono_utc["week_0g"]) + 32) % 64 - 32
     dt_s = tow_s - float(iono_utc["t0g_s"]) + SECONDS_PER_WEEK * weeks

@@ -132,7 +132,8 @@ def mechanise(pos_ecef_m, vel_ecef_mps, c_be, imu, start_s):
 
 
 def level_from_rest(accel_mps2):
-    """(pitch_rad, roll_rad) from the mean specific force (3,) of a vehicle at rest (Groves 2013, eq. 5.101).
+    """(pitch_rad, roll_rad) from the mean specific force (3,) of a vehicle at rest (Groves 2013, section
+    5.6.2).
 
     Raises
     ------

@@ -67,7 +67,9 @@ def test_parameters_not_decoded_are_left_out_and_said():
         nav = NavigationSpec(isb="ggto").start(FS_HZ)
         row = nav.update(transmit(sky, 30.0), ephemerides(sky), iono, iono)
         assert len(nav.notes) == 2 and "ionosphere" in nav.notes[1] and "GGTO" in nav.notes[0]
-        assert 0.5 < np.linalg.norm(_error(sky, row)[0]) < 30.0 and row["isb_m"] == pytest.approx(-1.5, abs=1.0)
+        assert 0.5 < np.linalg.norm(_error(sky, row)[0]) < 30.0 and row["isb_m"] == pytest.approx(
+            -1.5, abs=1.0
+        )
 
 
 def test_predicted_range_is_the_inertial_light_time():
@@ -273,10 +275,12 @@ def test_hatch_noise_and_slip():
         obs["sample_index"] = round(k * dt * FS_HZ)
         obs["carrier_phase_cycles"] = -velocity * k * dt / WAVELENGTH_M + jump
         obs["pseudorange_m"] = 2.2e7 + velocity * k * dt + noise * rng.standard_normal(runs)
-        hatch.smooth(obs)
-        return obs["pseudorange_smoothed_m"] - (2.2e7 + velocity * k * dt)
+        ratio = hatch.smooth(obs)
+        return ratio, obs["pseudorange_smoothed_m"] - (2.2e7 + velocity * k * dt)
 
-    def check(error, expected):
+    def check(epoch, expected):
+        ratio, error = epoch
+        np.testing.assert_allclose(ratio, (expected / sigma) ** 2, rtol=1e-3)
         assert np.std(error) == pytest.approx(expected, rel=Z / np.sqrt(2 * runs))
         assert abs(np.mean(error)) < Z * expected / np.sqrt(runs)
 
