@@ -22,7 +22,7 @@ from signals.modulation import autocorrelation
 
 __all__ = ["GlrtMonitor", "GlrtRun"]
 
-_BLOCK = 1024
+_BLOCK = 256  # epochs at a time: the products stay in the second-level cache
 _GUARD_CHIPS = {"L1CA": (-0.3, 0.0, 0.3, 0.65, 1.0), "E1B": (-0.15, 0.0, 0.15, 0.3, 0.6)}
 
 
@@ -70,13 +70,23 @@ def _windows(power, n_valid, length, total, filled, out, where):
 
 
 @njit(cache=True, nogil=True, fastmath={"contract", "nnan", "nsz"})
-def _peaks(power, best, where):
-    best[:] = np.float32(0.0)
-    where[:] = np.int64(0)
-    for k in range(power.shape[0]):
-        for e in range(power.shape[1]):
-            where[e] = k if power[k, e] > best[e] else where[e]
-            best[e] = max(best[e], power[k, e])
+def _peaks(p, q, best, where):
+    """Maximum of ``_bin_powers`` and its row, without the table: ``best`` float32, ``where`` int32 (E,)."""
+    n = p.shape[1] // 2
+    n_f = p.shape[0]
+    best[:] = np.float32(-1.0)
+    for k in range(n_f):
+        for e in range(n):
+            pr = p[k, e]
+            pi = p[k, n + e]
+            qr = q[k, e]
+            qi = q[k, n + e]
+            plus = (pr - qi) * (pr - qi) + (pi + qr) * (pi + qr)
+            minus = (pr + qi) * (pr + qi) + (pi - qr) * (pi - qr)
+            power = max(plus, minus)
+            row = np.int32(k) if plus >= minus else np.int32(n_f + k)
+            where[e] = row if power > best[e] else where[e]
+            best[e] = max(best[e], power)
 
 
 class GlrtMonitor(BaseModel):
@@ -131,7 +141,6 @@ class GlrtRun:
         self._sum = np.zeros(2 * n_f)
         self._z = np.empty((K, 2 * _BLOCK), np.float32)
         self._p, self._q = (np.empty((n_f, 2 * _BLOCK), np.float32) for _ in range(2))
-        self._power = np.empty((2 * n_f, _BLOCK), np.float32)
 
     def fresh(self):
         """A copy that keeps the training and begins at epoch 0."""
@@ -158,27 +167,31 @@ class GlrtRun:
         a = np.exp(-2j * np.pi * self.taps_chips * frequency_hz / CHIP_RATE_HZ)
         return float(np.linalg.norm(self.operator @ a))
 
-    def powers(self, z):
-        """|y_f|^2 of each epoch, float32 (2 F, E): +f, then -f. ``z`` float32 (K, 2 E), in-phase |
-        quadrature.
-        """
-        n = z.shape[1] // 2
-        if n != self._power.shape[1]:
-            n_f = len(self.frequency_hz)
-            self._p, self._q = (np.empty((n_f, 2 * n), np.float32) for _ in range(2))
-            self._power = np.empty((2 * n_f, n), np.float32)
+    def _products(self, z):
+        n = z.shape[1]
+        if n != self._p.shape[1]:
+            self._p, self._q = (np.empty((len(self.frequency_hz), n), np.float32) for _ in range(2))
         np.matmul(self._b_re, z, out=self._p)
         np.matmul(self._b_im, z, out=self._q)
-        _bin_powers(self._p, self._q, self._power)
-        return self._power
+
+    def powers(self, z):
+        """|y_f|^2 of each epoch, float32 (2 F, E): +f, then -f; ``z`` float32 (K, 2 E), in-phase |
+        quadrature.
+        """
+        self._products(z)
+        power = np.empty((2 * len(self.frequency_hz), z.shape[1] // 2), np.float32)
+        _bin_powers(self._p, self._q, power)
+        return power
 
     def block(self, z):
-        """T of each epoch of a block float32 (K, 2 E) -> float32 (E,)."""
-        power = self.powers(z)
-        best, where = np.empty(power.shape[1], np.float32), np.empty(power.shape[1], np.int64)
-        _peaks(power, best, where)
-        self._where = where
-        return best * np.float32(0.5 / self._variance())
+        """T of each epoch of a block float32 (K, 2 E) -> float32 (E,), and the row of its frequency, int32
+        (E,).
+        """
+        n = z.shape[1] // 2
+        best, where = np.empty(n, np.float32), np.zeros(n, np.int32)
+        self._products(z)
+        _peaks(self._p, self._q, best, where)
+        return best * np.float32(0.5 / self._variance()), where
 
     def whitened_statistic(self, y):
         """T of whitened vectors y = W z, complex (n, K), float64 (n,); slow, for tests and importance
@@ -241,17 +254,14 @@ class GlrtRun:
         """STATISTIC, one per epoch or per window of ``accumulate_epochs``; ``corr`` complex64 (n, K)."""
         corr = checked_corr(corr, len(self.taps_chips))
         M = self.spec.accumulate_epochs
-        scale = 0.5 / self._variance()
         values, bins, ends = [], [], []
-        out, where = np.empty(_BLOCK), np.empty(_BLOCK, np.int64)
         for lo in range(0, len(corr), _BLOCK):
             m = min(_BLOCK, len(corr) - lo)
             to_columns(corr, lo, self._z)
-            first = M - self._filled - 1
-            done, self._filled = _windows(self.powers(self._z), m, M, self._sum, self._filled, out, where)
-            values.append(out[:done] * scale)
-            bins.append(where[:done].copy())
-            ends.append(lo + first + M * np.arange(done))
+            value, where, last = self._epochs(m) if M == 1 else self._windows(m)
+            values.append(value)
+            bins.append(where)
+            ends.append(lo + last)
         value, ends = np.concatenate(values or [[]]), np.concatenate(ends or [[]]).astype(np.int64)
         signed_hz = np.concatenate([self.frequency_hz, -self.frequency_hz])
         hz = signed_hz[np.concatenate(bins).astype(np.int64)] if bins else np.zeros(0)
@@ -259,6 +269,19 @@ class GlrtRun:
         result = statistics(value, self.epoch + ends, self.integration_s, hz, index)
         self.epoch += len(corr)
         return result
+
+    def _epochs(self, m):
+        value, where = self.block(self._z)
+        return value[:m], where[:m], np.arange(m)
+
+    def _windows(self, m):
+        """Windows that end among the next m epochs: statistic, row, last epoch."""
+        M = self.spec.accumulate_epochs
+        out, where = np.empty(m), np.empty(m, np.int64)
+        first = M - self._filled - 1
+        power = self.powers(self._z)
+        done, self._filled = _windows(power, m, M, self._sum, self._filled, out, where)
+        return out[:done] * (0.5 / self._variance()), where[:done], first + M * np.arange(done)
 
 
 def _inverse_root(R):
