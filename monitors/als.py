@@ -225,7 +225,7 @@ def als_model(
         )
     if np.any(log.var[log.used] < 0):
         raise ValueError("The epoch log holds negative measurement variances.")
-    p, n = rows.size, log.phi.shape[1]
+    p = rows.size
     pairs = row_pairs(p, full)
     other = np.setdiff1d(np.flatnonzero(log.used.any(axis=0)), rows).astype(np.int64)
     known, columns = np.zeros((2, n_lags, p, p)), np.zeros((len(pairs), n_lags, p, p))

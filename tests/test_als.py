@@ -64,7 +64,9 @@ def test_model_is_the_exact_covariance(full, n_lags):
     model = als.als_model(log, n_lags=n_lags, full=full, settle=5, p_start=p_start)
     exact, end = exact_lags(log, r_true, p_start, n_lags, 5)
     theta = np.array([r_true[a, b] for a, b in model.basis])
-    np.testing.assert_allclose(model.known + np.tensordot(theta, model.columns, axes=1), exact, rtol=1e-9, atol=1e-10)
+    np.testing.assert_allclose(
+        model.known + np.tensordot(theta, model.columns, axes=1), exact, rtol=1e-9, atol=1e-10
+    )
     result = als.solve(model, exact)
     np.testing.assert_allclose(result.r_cov_m2, r_true, rtol=1e-8, atol=1e-8)
     np.testing.assert_allclose(result.covariance, end, rtol=1e-8, atol=1e-9)
@@ -113,7 +115,9 @@ def test_unbiased_and_at_the_chi_square_floor(ten_hz):
     r, _ = eskf.replay(log, problem.p0, np.full(7, 100.0), runs, np.random.default_rng(2))
     results = [als.solve(model, als.autocovariance(r[:, i], log.used, 2, SETTLE)) for i in range(runs)]
     sigma = np.array([x.sigma_m for x in results])
-    plain = np.array([np.sqrt(np.diag(als.autocovariance(r[:, i], log.used, 1, SETTLE)[0])) for i in range(runs)])
+    plain = np.array(
+        [np.sqrt(np.diag(als.autocovariance(r[:, i], log.used, 1, SETTLE)[0])) for i in range(runs)]
+    )
     floor = 10 / np.sqrt(2 * 500)
     spread = sigma.std(axis=0, ddof=1).mean()
     # std of a std: 1/sqrt(2 x 7 x 99) = 2.7 % -> z = 5 is 13 %; the floor is reached within 4 %.

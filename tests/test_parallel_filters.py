@@ -73,7 +73,9 @@ def test_kalman_residual_is_chi_square_one_epoch_at_a_time():
     """One residual alone is normal with variance A, when R is the truth (R0 = 0): mean of r^2/A within z = 5."""
     s = vanek.scene("G*")
     runs = 300
-    out = vanek.simulate(s, vanek.spec(r0_ft2=0.0), vanek.step_fault(0), runs, 3, adapt=False, detect=False, traces=runs)
+    out = vanek.simulate(
+        s, vanek.spec(r0_ft2=0.0), vanek.step_fault(0), runs, 3, adapt=False, detect=False, traces=runs
+    )
     q = out.resid[:, 240, 0] ** 2 / out.resid_var[:, 240, 0]
     assert abs(q.mean() - 1) < 5 * math.sqrt(2 / runs)
 
@@ -174,7 +176,7 @@ def test_absent_satellite_does_not_disturb():
 
 def test_shift_follows_the_injection_of_a_feedback_filter():
     """The same measurements seen from a corrected nominal give the same residuals."""
-    phi, qd, h, baro, z, _, p0 = problem(5, 30, 14)
+    phi, qd, h, _, z, _, p0 = problem(5, 30, 14)
     a, b = ParallelFilters().start(5, p0), ParallelFilters().start(5, p0)
     total = np.zeros(13)
     for t in range(30):

@@ -17,7 +17,9 @@ def test_rows_go_to_csv_and_json_unchanged(tmp_path):
     assert json.loads((tmp_path / "new" / "t.json").read_text()) == rows
     with path.open(newline="") as handle:
         read = list(csv.DictReader(handle))
-    assert read[0]["note"] == "n, with comma" and read[1]["ci_low"] == "" and read[1]["verdict"] == "not stated"
+    assert (
+        read[0]["note"] == "n, with comma" and read[1]["ci_low"] == "" and read[1]["verdict"] == "not stated"
+    )
     assert "reproduced" in reproduce.format_table(rows)
 
 

@@ -16,8 +16,8 @@ from monitors import noise_rmd
 from monitors import parallel_filters as pf
 from nav import eskf
 from nav.errormodels import FOOT_M, Pinson13, measurement_rows, pinson_state, unit_vectors_enu
-from signals.range_errors import RangeErrors
 from sdr.reproduce import clopper_pearson, new_figure, row, save_figure, write_table
+from signals.range_errors import RangeErrors
 
 GEOMETRY = {
     "G*": ((202.0, 144.0, 221.0, 71.0), (21.0, 53.0, 53.0, 41.0)),
