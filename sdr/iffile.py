@@ -405,7 +405,7 @@ class RecordingSource:
 
     def _load(self, offset: int, size: int) -> None:
         self._file.seek(offset)
-        view, got = memoryview(self._buffer)[:size], 0
+        view, got = self._buffer.data[:size], 0
         while got < size:
             step = self._file.readinto(view[got:])
             if not step:
@@ -586,7 +586,7 @@ class RecordingWriter:
 
     def _append(self, raw: np.ndarray, sample_bytes: int) -> None:
         """Write all bytes, or leave whole samples and let the error pass."""
-        view, done = memoryview(raw), 0
+        view, done = raw.data, 0
         try:
             while done < len(view):
                 done += self._file.write(view[done:]) or 0

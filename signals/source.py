@@ -98,7 +98,8 @@ class SyntheticSource:
         self._ahead = 2 * threads if threads > 1 else 1
         self._pending: deque[Future | tuple] = deque()
         self._next_cell = 0
-        self._group = (-1, *[np.zeros(0)] * 3)
+        empty = np.zeros(0)
+        self._group: tuple[int, np.ndarray, np.ndarray, np.ndarray] = (-1, empty, empty, empty)
         self._cell = np.zeros((2, 0), front_end.dtype)
         self._used = 0
         self._position = 0
@@ -281,7 +282,7 @@ def _messages(sky: Sky, satellite: Satellite, start_s: int):
         tow = sky.tow_s + start_s
         week, tow = sky.week + tow // 604_800, tow % 604_800
         messages = [
-            (encode(satellite.ephemeris, sky.iono_utc, almanac, week, tow, span_s * per_s), first, periods)
+            (encode(satellite.ephemeris, sky.iono_utc[()], almanac, week, tow, span_s * per_s), first, periods)
         ]
     if system == "E":
         messages.append((secondary_code().astype(np.int8), 0, 1))
