@@ -13,6 +13,7 @@ from signals.modulation import SIGNALS
 from tracking.correlator_model import TwinCW, jammer_hz
 from tracking.twin_kernels import hatch_smooth
 
+_PART = 16_384  # monitor epochs at a time: bounds the memory of a long trial
 __all__ = ["TrialResult", "simulate_points", "simulate_trial", "sum_dumps", "train_monitors", "trial_seed"]
 
 
@@ -42,6 +43,8 @@ def sum_dumps(corr, n):
 
     Data signs must be wiped.
     """
+    if n == 1:
+        return corr
     m = len(corr) // n
     return corr[: m * n].reshape(m, n, corr.shape[1]).mean(axis=1)
 
@@ -86,12 +89,17 @@ def simulate_trial(spec, runs, root, point, trial, n_epochs, settle_epochs=500, 
     belong to the trial (time zero is at their start) but are not tested; jammers should start after them.
     """
     twin = spec.start(trial_seed(root, point, trial))
-    epochs, corr = twin(settle_epochs + n_epochs)
-    epochs, corr = epochs[settle_epochs:], corr[settle_epochs:]
-    summed = sum_dumps(corr, dumps)
-    statistics = {}
-    for name, run in runs.items():
-        statistics[name] = run.fresh()(summed)
+    twin(settle_epochs)
+    fresh = {name: run.fresh() for name, run in runs.items()}
+    parts, statistics = [], {name: [] for name in runs}
+    for lo in range(0, n_epochs, _PART * dumps):
+        epochs, corr = twin(min(_PART * dumps, n_epochs - lo))
+        parts.append(epochs)
+        summed = sum_dumps(corr, dumps)
+        for name, run in fresh.items():
+            statistics[name].append(run(summed))
+    epochs = np.concatenate(parts)
+    statistics = {name: np.concatenate(v) for name, v in statistics.items()}
     code_m = epochs["code_error_chips"] * METRES_PER_CHIP
     smoothed = np.empty(len(code_m))
     n_smooth = max(1, round(smooth_s / spec.integration_s))

@@ -324,7 +324,8 @@ def _tap_vectors(spec, x, taps):
 
 
 def _chebyshev(spec, low, high, taps):
-    """Chebyshev coefficients of the tap vectors over f T in [low, high] -> (centre, half width), complex64 (J, K).
+    """Chebyshev coefficients of the tap vectors over f T in [low, high] -> (centre, half width), complex64
+    (J, K).
 
     The sinc has exponential type pi: terms fall like (pi w / 2)^j / j!.
     """
@@ -428,8 +429,8 @@ class _Stage:
 class _SlowNBI:
     """Noise of small B T: exact in time and over the taps, made in overlapped FFT blocks.
 
-    A sum of many Gaussian tones; the tap vector of each by the Chebyshev series over the band, so that J sequences of
-    epochs times J tap vectors make the whole.
+    A sum of many Gaussian tones; the tap vector of each by the Chebyshev series over the band, so that J
+    sequences of epochs times J tap vectors make the whole.
     """
 
     def __init__(self, stage, number, jammer):
@@ -545,6 +546,9 @@ class _Block:
     chips: np.ndarray
     slow: np.ndarray
     truth: np.ndarray
+    wanted: np.ndarray
+    out: np.ndarray
+    corr: np.ndarray
 
 
 class TwinRun:
@@ -634,23 +638,19 @@ class TwinRun:
 
     def _advance(self, index, lo, hi, steer, truth):
         b = self._prepare(index)
-        wanted = np.zeros((BLOCK_EPOCHS, 3))
         if steer is not None:
-            wanted[lo:hi] = steer
+            b.wanted[lo:hi] = steer
         if truth is not None:
             b.truth[lo:hi] = truth
-        out = np.empty((BLOCK_EPOCHS, TWIN_COLUMNS))
-        corr = np.empty((BLOCK_EPOCHS, len(self.stage.taps)), np.complex64)
-        # From the whole block where the truth is the twin's own, so that cutting a run changes nothing.
-        reached = b.truth[:, 1] if truth is None else b.truth[lo:hi, 1]
-        spans, vectors = self._vectors(index, reached)
+            self._vectors(index, b.truth[lo:hi, 1])
+        spans, vectors = self._spans
         closed_loop(
             self.state,
             index * BLOCK_EPOCHS,
             lo,
             hi,
             self.steered,
-            wanted,
+            b.wanted,
             b.truth,
             b.signs,
             self.spec.wiped,
@@ -667,10 +667,10 @@ class TwinRun:
             b.slow,
             self.geometry,
             self.loop,
-            out,
-            corr,
+            b.out,
+            b.corr,
         )
-        return out, corr
+        return b.out, b.corr
 
     def _prepare(self, index):
         """Everything about a block that does not depend on the loops."""
@@ -694,15 +694,22 @@ class TwinRun:
             chips,
             np.concatenate(slow) if slow else np.zeros((0, BLOCK_EPOCHS), np.complex64),
             self.truth(mid_s),
+            np.zeros((BLOCK_EPOCHS, 3)),
+            np.empty((BLOCK_EPOCHS, TWIN_COLUMNS)),
+            np.empty((BLOCK_EPOCHS, len(s.taps)), np.complex64),
         )
+        self._vectors(index, self._block.truth[:, 1])
         return self._block
 
     def _vectors(self, index, freq_hz):
-        """Chebyshev tables over where the jammers go within the block; kept while they suffice."""
+        """Chebyshev tables over where the jammers go within a block; the old ones stay while they suffice.
+
+        Asked for the whole block where the truth is the twin's own, so that cutting a run changes nothing.
+        """
         s = self.stage
         ranges = _reach(s.cws, s.mid_s(index), freq_hz, self.spec.integration_s)
         if self._spans is not None and _covers(self._spans[0], ranges):
-            return self._spans
+            return
         spans, vectors, row = [], [np.zeros((0, len(s.taps)), np.complex64)], 0
         for low, high in ranges:
             span, v = _chebyshev(self.spec, low - _MARGIN, high + _MARGIN, s.taps)
@@ -710,7 +717,6 @@ class TwinRun:
             vectors.append(v)
             row += len(v)
         self._spans = np.array(spans, float).reshape(-1, 4), np.concatenate(vectors)
-        return self._spans
 
 
 def _reach(cws, mid_s, freq_hz, T):
@@ -754,7 +760,8 @@ def _records(columns, epoch0, T):
 class OpenLoopRun:
     """No loops and no tracking error: ``block(i)`` is a pure function of the seed and i.
 
-    All terms but the noise are rank one, (taps) x (time), so a block is a single matrix product
+    All terms but the noise are rank one, (taps) x (time), so a block is a single matrix product; the delay
+    of an echo is held at its middle for that (``start`` moves it every epoch).
     Z = [F | R | echoes | lines] [normals ; time sequences], with columns in-phase then quadrature.
     """
 
