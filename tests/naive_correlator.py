@@ -45,6 +45,8 @@ def correlate(epoch, iq, table, taps_q, fs_hz, if_hz, signs=None):
     """All taps of one integration of samples ``iq`` (2, n) that begin at sample 0."""
     total = np.zeros(len(taps_q), complex)
     for k, (start, n, phase, rate) in enumerate(periods(epoch, table.code_length_chips, fs_hz)):
-        z = (iq[0, start : start + n] + 1j * iq[1, start : start + n]) * carrier(epoch, start, n, fs_hz, if_hz)
+        z = (iq[0, start : start + n] + 1j * iq[1, start : start + n]) * carrier(
+            epoch, start, n, fs_hz, if_hz
+        )
         total += (1.0 if signs is None else signs[k]) * (replica(table, taps_q, n, phase, rate) @ z)
     return total / int(epoch["n_samples"])

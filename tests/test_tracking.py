@@ -102,7 +102,9 @@ def test_same_bits_for_any_slab_size_and_threads(signal):
             for c in range(2):
                 out[c].append(e[c, : counts[c]].tobytes() + z[c, : counts[c]].tobytes())
             n0, k = n0 + n, k + 1
-        return [b"".join(x) for x in out], [tracker.channels[n].tobytes() for n in ("code_phase_chips", "carrier_cycles")]
+        return [b"".join(x) for x in out], [
+            tracker.channels[n].tobytes() for n in ("code_phase_chips", "carrier_cycles")
+        ]
 
     def split(out):
         return out
@@ -129,7 +131,9 @@ def test_sample_types_agree(dtype):
 # ------------------------------------------------------------------------------------------------ closed loops
 def closed_loop(signal, cn0s, seconds, pll_bw, dll_bw, seed):
     """Track the same signal at several C/N0; EPOCH rows after 2 s with code and phase errors -> list of dicts."""
-    sat = Satellite(signal, 5, FS, doppler_hz=1711.3, code_chips=300.3, waveform=None if signal == "L1CA" else "BOC11")
+    sat = Satellite(
+        signal, 5, FS, doppler_hz=1711.3, code_chips=300.3, waveform=None if signal == "L1CA" else "BOC11"
+    )
     spec = spec_for(signal, pll_bw_hz=pll_bw, dll_bw_hz=dll_bw)
     trackers = [spec.start(FS) for _ in cn0s]
     for t in trackers:
@@ -146,7 +150,9 @@ def closed_loop(signal, cn0s, seconds, pll_bw, dll_bw, seed):
         e = e[e["sample_index"] > 2.0 * FS]
         phase = sat.phase_error(e)
         phase -= np.round(np.mean(phase) * 2) / 2
-        rows.append({"cn0": component_cn0(signal, cn0), "epochs": e, "code": sat.code_error(e), "phase": phase})
+        rows.append(
+            {"cn0": component_cn0(signal, cn0), "epochs": e, "code": sat.code_error(e), "phase": phase}
+        )
     return rows, trackers
 
 
@@ -168,8 +174,12 @@ def check_jitter(signal, seconds, worst):
         code = loops.dll_jitter_chips(cn0, dll_bw, T, spacing, slope, 1 - slope * spacing)
         phase = loops.pll_jitter_cycles(cn0, pll_bw, T, costas=signal == "L1CA")
         t = seconds - 2.0
-        assert np.std(row["phase"]) / phase == pytest.approx(1.0, abs=min(worst, 5 / np.sqrt(4 * pll_bw * t) + 0.03))
-        assert np.std(row["code"]) / code == pytest.approx(1.0, abs=min(worst, 5 / np.sqrt(4 * dll_bw * t) + 0.03))
+        assert np.std(row["phase"]) / phase == pytest.approx(
+            1.0, abs=min(worst, 5 / np.sqrt(4 * pll_bw * t) + 0.03)
+        )
+        assert np.std(row["code"]) / code == pytest.approx(
+            1.0, abs=min(worst, 5 / np.sqrt(4 * dll_bw * t) + 0.03)
+        )
         assert abs(np.mean(row["phase"])) < 5 * phase / np.sqrt(2 * pll_bw * t)
         assert abs(np.mean(row["code"])) < 5 * code / np.sqrt(2 * dll_bw * t) + 1e-3
         # Prompt: 1 - slope E|code error| of the peak, cos of the phase error; rounding to int8 and tables 0.3 %.
@@ -210,7 +220,9 @@ def test_a_frequency_ramp_is_followed(signal):
     # Within an integration the NCO stands still: the phase bends by ramp T^2 / 24 = 0.004 cycle about the middle.
     assert abs(np.mean(phase)) < 5 * sigma / np.sqrt(2 * 15.0) + 0.006
     assert np.max(np.abs(sat.code_error(e))) < 0.05
-    assert np.mean(e["doppler_hz"] - sat.doppler(e["sample_index"] + e["n_samples"] / 2)) == pytest.approx(0, abs=1.5)
+    assert np.mean(e["doppler_hz"] - sat.doppler(e["sample_index"] + e["n_samples"] / 2)) == pytest.approx(
+        0, abs=1.5
+    )
 
 
 # ------------------------------------------------------------------------------------------- synchronisation
@@ -335,7 +347,10 @@ def test_steered_nco_follows_the_command():
 
 
 def test_snapshot_is_the_replica_at_one_sample():
-    sats = [Satellite("L1CA", 5, FS, doppler_hz=2000.0, code_chips=5.0), Satellite("E1C", 6, FS, code_chips=1500.0)]
+    sats = [
+        Satellite("L1CA", 5, FS, doppler_hz=2000.0, code_chips=5.0),
+        Satellite("E1C", 6, FS, code_chips=1500.0),
+    ]
     tracker = TrackingSpec().start(FS)
     for s in sats:
         tracker.add(s.acquisition(0, 10.0, 0.1))
@@ -347,7 +362,9 @@ def test_snapshot_is_the_replica_at_one_sample():
         assert abs(difference - round(difference)) * s.length < 0.03
         assert r["doppler_hz"] == pytest.approx(s.doppler_hz, abs=1.5)
         assert r["phase_locked"] and 0.5 < r["lock_s"] < 2.0
-        assert (r["carrier_phase_cycles"] - s.cycles(n) - s.phase0 + 0.25) % 0.5 == pytest.approx(0.25, abs=0.03)
+        assert (r["carrier_phase_cycles"] - s.cycles(n) - s.phase0 + 0.25) % 0.5 == pytest.approx(
+            0.25, abs=0.03
+        )
 
 
 # ---------------------------------------------------------------------------------------------- bad input

@@ -57,9 +57,16 @@ class Satellite:
     def __init__(self, signal, prn, fs_hz, if_hz=0.0, doppler_hz=0.0, ramp_hz_s=0.0, code_chips=0.0, phase0=0.1,
                  waveform=None, seed=1, symbols=None):  # fmt: skip
         self.signal, self.prn, self.fs_hz, self.if_hz = signal, prn, fs_hz, if_hz
-        self.doppler_hz, self.ramp_hz_s, self.code_chips, self.phase0 = doppler_hz, ramp_hz_s, code_chips, phase0
+        self.doppler_hz, self.ramp_hz_s, self.code_chips, self.phase0 = (
+            doppler_hz,
+            ramp_hz_s,
+            code_chips,
+            phase0,
+        )
         names = ("L1CA",) if signal == "L1CA" else ("E1B", "E1C")
-        parts = [np.outer(primary_code(n, prn), chip_waveform(waveform or SIGNALS[n].waveform)) for n in names]
+        parts = [
+            np.outer(primary_code(n, prn), chip_waveform(waveform or SIGNALS[n].waveform)) for n in names
+        ]
         self.data = parts[0]
         self.pilot = parts[1] if len(parts) == 2 else np.zeros((0, 1))
         self.length = len(self.data)
@@ -101,7 +108,9 @@ class Satellite:
     def phase_error(self, epochs):
         """Replica minus signal, cycles, at mid-integration (NCO frequency constant within one)."""
         middle = epochs["sample_index"] + 0.5 * epochs["n_samples"]
-        replica = epochs["carrier_phase_cycles"] + epochs["doppler_hz"] * 0.5 * epochs["n_samples"] / self.fs_hz
+        replica = (
+            epochs["carrier_phase_cycles"] + epochs["doppler_hz"] * 0.5 * epochs["n_samples"] / self.fs_hz
+        )
         return replica - self.phase0 - self.cycles(middle)
 
 

@@ -364,15 +364,19 @@ class Tracker:
         m_settle = min(m_track, round(20e-3 / period))
         T_settle = m_settle * period
         st["m_track"], st["m_settle"] = m_track, m_settle
-        settle_bw = min(spec.settle_pll_bw_hz, MAX_BT / T_settle)
-        st["pll_settle"] = pll_gains(loops.pll_order, settle_bw, T_settle)
+        bw, stage = min(spec.settle_pll_bw_hz, MAX_BT / T_settle), 0
+        while stage == 0 or (bw > 1.2 * loops.pll_bw_hz and stage < len(st["stage_s"])):
+            st["pll_stages"][stage] = pll_gains(loops.pll_order, bw, T_settle)
+            st["stage_s"][stage] = spec.settle_s if stage == 0 else 2.0 / bw
+            bw, stage = 0.5 * bw, stage + 1
+        st["n_stages"] = stage
         st["pll_track"] = pll_gains(loops.pll_order, loops.pll_bw_hz, T_s)
         st["dll_pull"] = dll_gains(1, spec.pull_in_dll_bw_hz, period)[0]
         st["dll_settle"] = dll_gains(1, max(spec.settle_dll_bw_hz, loops.dll_bw_hz), T_settle)[0]
         st["dll_track"] = dll_gains(loops.dll_order, loops.dll_bw_hz, T_s)
         st["fll_settle"] = fll_gain(spec.settle_fll_bw_hz, T_settle)
         st["fll_track"] = fll_gain(loops.fll_bw_hz, T_s)
-        for name in ("settle_s", "cn0_window_s", "cn0_min_dbhz", "lock_in", "lock_out", "lost_after_s"):
+        for name in ("cn0_window_s", "cn0_min_dbhz", "lock_in", "lock_out", "lost_after_s"):
             st[name] = getattr(spec, name)
 
     # ------------------------------------------------------------------------------------------------ run
@@ -408,7 +412,8 @@ class Tracker:
         shape = (len(self.channels), n_max)
         epochs, corr = np.zeros(shape, EPOCH), np.zeros((*shape, self._tap_q.shape[1] - 2), np.complex64)
         counts = np.zeros(shape[0], np.int64)
-        self.symbols, self.symbol_counts = np.zeros(shape, SYMBOL), np.zeros(shape[0], np.int64)
+        self.symbols = np.zeros((shape[0], n_max + HISTORY // 4), SYMBOL)
+        self.symbol_counts = np.zeros(shape[0], np.int64)
         active = np.flatnonzero(
             (self.channels["state"] != STATE_IDLE) & (self.channels["state"] != STATE_LOST)
         )

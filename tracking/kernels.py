@@ -87,14 +87,15 @@ CHANNEL = np.dtype(
         ("r_half", "f8"),  # R(d/2) / R(0)
         ("m_settle", "i4"),  # code periods per integration
         ("m_track", "i4"),
-        ("pll_settle", "f8", 3),
+        ("n_stages", "i4"),  # of settling, each with half the carrier bandwidth of the one before
+        ("pll_stages", "f8", (8, 3)),
+        ("stage_s", "f8", 8),
         ("pll_track", "f8", 3),
         ("dll_pull", "f8"),
         ("dll_settle", "f8"),
         ("dll_track", "f8", 2),
         ("fll_settle", "f8"),
         ("fll_track", "f8"),
-        ("settle_s", "f8"),
         ("cn0_window_s", "f8"),
         ("cn0_min_dbhz", "f8"),
         ("lock_in", "f8"),
@@ -144,6 +145,7 @@ CHANNEL = np.dtype(
         # Synchronisation and lock.
         ("hist_n", "i4"),
         ("hist_period", "i8"),
+        ("hist_sample", "i8"),
         ("attempts", "i4"),
         ("bit_energy", "f8", 20),
         (
@@ -157,7 +159,8 @@ CHANNEL = np.dtype(
         ("symbol_period", "i8"),
         ("symbol_m", "i4"),
         ("settling", "i4"),
-        ("locked_time_s", "f8"),  # since loops closed
+        ("stage", "i4"),
+        ("stage_time_s", "f8"),
         ("phase_locked", "i4"),
         ("lock_start_sample", "i8"),
         ("bad_s", "f8"),
@@ -378,6 +381,11 @@ def _turn_back(hist, n, dt, f, r, out):
 
 
 @njit(nogil=True)
+def _angle_cycles(z):
+    return math.atan2(z.imag, z.real) / _TWO_PI
+
+
+@njit(nogil=True)
 def _bit_energies(z, energy):
     """Energy of 9 sums of 20 prompts for each of 20 bit edges; returns the largest and its edge."""
     best, edge = -1.0, 0
@@ -400,8 +408,8 @@ def _search_ca(hist, noise, energy):
     """Joint search over frequency (+-250 Hz), its rate (+-600 Hz/s) and bit edge: energies of 9 sums of 20 ms.
 
     hist: (200, 2) prompts of 1 ms with a fixed NCO. A rate is believed only where it brings more energy than noise
-    would (20 times the noise of one sum). ``energy`` (20,): per bit edge at the best frequency. Returns (frequency error
-    at the end of the history, rate, best energy).
+    would (20 times the noise of one sum). ``energy`` (20,): per bit edge at the best frequency. Returns (frequency
+    error and its rate, phase in cycles, best energy); frequency and phase at the middle of the history.
     """
     step, dt = 10.0, 1e-3
     z, trial = np.empty((HISTORY, 2)), np.empty(20)
@@ -426,7 +434,14 @@ def _search_ca(hist, noise, energy):
     _turn_back(hist, HISTORY, dt, f + step, r, z)
     _bit_energies(z, trial)
     f += step * _peak_offset(left, best, trial[edge])
-    return f + 0.5 * r * HISTORY * dt, r, best
+    _turn_back(hist, HISTORY, dt, f, r, z)
+    square = 0.0 + 0.0j
+    for m in range(9):
+        total = 0.0 + 0.0j
+        for k in range(edge + 20 * m, edge + 20 * m + 20):
+            total += complex(z[k, 0], z[k, 1])
+        square += total * total
+    return f, r, _angle_cycles(square) * 0.5, best
 
 
 @njit(nogil=True)
@@ -450,25 +465,28 @@ def _pilot_energies(z, secondary, energy):
 
 
 @njit(nogil=True)
-def _search_pilot(hist, secondary):
+def _search_pilot(hist, secondary, noise):
     """Joint search over frequency, its rate (+-300 Hz/s) and secondary-code phase: energies of 2 sums of 25 periods.
 
     hist: (100, 2) prompts of 2 ms (halves of a period). The phase between the halves gives the frequency within
-    +-50 Hz first. Returns (frequency error at the end, rate, chip at the first period, best energy, best energy of
-    any other chip).
+    +-50 Hz first. Returns (frequency error and its rate, phase in cycles, chip at the first period, best energy, best
+    energy of any other chip); frequency and phase at the middle.
     """
     step, dt, n = 2.5, 2e-3, HISTORY // 2
     z, trial, energy = np.empty((n, 2)), np.empty(25), np.zeros(25)
     f0, _ = _search_data(hist)
-    best, f, r, chip = -1.0, 0.0, 0.0, 0
-    for m in range(-10, 11):
+    best, still, f, r, chip = -1.0, 0.0, 0.0, 0.0, 0
+    for m in range(21):
+        rate = 30.0 * ((m + 1) // 2) * (1 if m & 1 else -1)  # 0, 30, -30, 60, ..
         for k in range(-20, 21):
-            _turn_back(hist, n, dt, f0 + k * step, 30.0 * m, z)
+            _turn_back(hist, n, dt, f0 + k * step, rate, z)
             total, shift = _pilot_energies(z, secondary, trial)
             for i in range(25):
                 energy[i] = max(energy[i], trial[i])
-            if total > best:
-                best, f, r, chip = total, f0 + k * step, 30.0 * m, shift
+            if total > best and (m == 0 or total > still + 20.0 * 25.0 * noise):
+                best, f, r, chip = total, f0 + k * step, rate, shift
+        if m == 0:
+            still = best
     second = 0.0
     for i in range(25):
         if i != chip:
@@ -479,7 +497,13 @@ def _search_pilot(hist, secondary):
     _turn_back(hist, n, dt, f + step, r, z)
     _pilot_energies(z, secondary, trial)
     f += step * _peak_offset(left, best, trial[chip])
-    return f + 0.5 * r * n * dt, r, chip, best, second
+    _turn_back(hist, n, dt, f, r, z)
+    total = 0.0 + 0.0j
+    for k in range(50):
+        total += secondary[(chip + k) % 25] * complex(
+            z[2 * k, 0] + z[2 * k + 1, 0], z[2 * k, 1] + z[2 * k + 1, 1]
+        )
+    return f, r, _angle_cycles(total), chip, best, second
 
 
 @njit(nogil=True)
@@ -525,8 +549,7 @@ def _noise_power(st):
 def _close_loops(st, sample):
     """Symbols are aligned: from here on the loops run at the settling bandwidths."""
     st.state = STATE_LOCKED
-    st.settling = 1
-    st.locked_time_s = 0.0
+    st.settling, st.stage, st.stage_time_s = 1, 0, 0.0
     st.phase_locked = 0
     st.bad_s = 0.0
     st.code_rate_chips_s = 0.0
@@ -543,14 +566,48 @@ def _retry(st, limit):
 
 
 @njit(nogil=True)
-def _set_frequency(st, error_hz, rate_hz_s):
+def _set_carrier(st, f, r, cycles):
+    """Move the NCO to the carrier found: f, its rate r and phase hold at the middle of the history of 0.2 s."""
     if st.steered == 0:
-        st.doppler_hz += error_hz
-        st.rate_hz, st.rate_hz_s = st.doppler_hz, rate_hz_s
+        t = 0.1
+        st.doppler_hz += f + r * t
+        st.rate_hz, st.rate_hz_s = st.doppler_hz, r
+        st.carrier_cycles += cycles + f * t + 0.5 * r * t * t
 
 
 @njit(nogil=True)
-def _synchronise(st, hist, secondary, noise):
+def _past_symbols(st, hist, secondary, f, r, chip, symbols, count):
+    """E1-B symbols of the history, once its frequency, rate and secondary-code phase are known.
+
+    Each 25 periods are turned upright by the phase of their pilot sum, so that data begin where samples begin.
+    """
+    n = HISTORY // 2
+    z = np.empty((n, 2))
+    _turn_back(hist, n, 2e-3, f, r, z)
+    data, upright = np.empty((n // 2, 2)), np.empty((n // 2, 2))
+    for k in range(n // 2):
+        data[k, 0], data[k, 1] = hist[n + k, 0], hist[n + k, 1]
+    _turn_back(data, n // 2, 4e-3, f, r, upright)
+    for m in range(2):
+        re = im = 0.0
+        for k in range(25):
+            sign = secondary[(chip + k) % 25]
+            re += sign * (z[50 * m + 2 * k, 0] + z[50 * m + 2 * k + 1, 0])
+            im += sign * (z[50 * m + 2 * k, 1] + z[50 * m + 2 * k + 1, 1])
+        norm = math.hypot(re, im)
+        for k in range(25 * m, 25 * m + 25):
+            if count < len(symbols):
+                row = symbols[count]
+                row.code_period = st.hist_period + k
+                row.sample_index = st.hist_sample + np.int64(k * st.samples_per_chip * st.code_length_chips)
+                row.soft = (upright[k, 0] * re + upright[k, 1] * im) / norm
+                row.soft_q = (upright[k, 1] * re - upright[k, 0] * im) / norm
+                count += 1
+    return count
+
+
+@njit(nogil=True)
+def _synchronise(st, hist, secondary, noise, symbols, count):
     """Use a full history: find the frequency and the symbol (or secondary-code) edge, or try again.
 
     noise: power of a prompt of one code period. Thresholds: the sums of noise alone exceed them with less
@@ -559,17 +616,17 @@ def _synchronise(st, hist, secondary, noise):
     """
     st.hist_n = 0
     if _bump_decision(st, 1.5):
-        return
+        return count
     if st.kind == KIND_CA:
         energy = np.empty(20)
-        f, rate, best = _search_ca(hist, noise, energy)
+        f, rate, cycles, best = _search_ca(hist, noise, energy)
         if best < 4.0 * 180.0 * noise:
             st.state = STATE_PULL_IN
             st.bit_energy[:] = 0.0
             _retry(st, 5)
-            return
+            return count
         st.state = STATE_BIT_SYNC
-        _set_frequency(st, f, rate)
+        _set_carrier(st, f, rate, cycles)
         top, second, edge = -1.0, -1.0, 0
         for e in range(20):
             k = (st.hist_period + e) % 20
@@ -588,11 +645,12 @@ def _synchronise(st, hist, secondary, noise):
         else:
             _retry(st, 20)
     elif st.kind == KIND_PILOT:
-        f, rate, chip, best, second = _search_pilot(hist, secondary)
+        f, rate, cycles, chip, best, second = _search_pilot(hist, secondary, noise)
         if best < 25.0 * 25.0 * noise or best < 1.5 * second:
             _retry(st, 5)
-            return
-        _set_frequency(st, f, rate)
+            return count
+        count = _past_symbols(st, hist, secondary, f, rate, chip, symbols, count)
+        _set_carrier(st, f, rate, cycles)
         st.symbol_phase = (chip - st.hist_period) % 25
         _close_loops(st, st.next_sample)
     else:
@@ -600,10 +658,11 @@ def _synchronise(st, hist, secondary, noise):
         # Products of halves: variance of the mean of 50, each half with power 2 noise.
         if magnitude < 4.0 * math.sqrt(50.0) * 2.0 * noise:
             _retry(st, 5)
-            return
-        _set_frequency(st, f, 0.0)
+            return count
+        _set_carrier(st, f, 0.0, 0.0)
         st.symbol_phase = 0
         _close_loops(st, st.next_sample)
+    return count
 
 
 @njit(nogil=True)
@@ -759,7 +818,7 @@ def _false_frequency(st, i1, q1, i2, q2, T_s):
     st.rate_hz += f
     st.doppler_hz = st.rate_hz
     st.rate_hz_s = 0.0
-    st.settling, st.locked_time_s = 1, 0.0
+    st.settling, st.stage, st.stage_time_s = 1, 0, 0.0
     _reset_moments(st)
     return True
 
@@ -767,16 +826,30 @@ def _false_frequency(st, i1, q1, i2, q2, T_s):
 @njit(nogil=True)
 def _steer(st, phase_error, freq_error, code_err, T_s):
     """Loop filters of one integration (equations in ``loops.py``)."""
-    k = st.pll_settle if st.settling else st.pll_track
-    fll = st.fll_settle if st.settling else st.fll_track
-    st.rate_hz_s += k[2] * phase_error / (T_s * T_s)
-    st.rate_hz += k[1] * phase_error / T_s + st.rate_hz_s * T_s + fll * freq_error
-    st.doppler_hz = st.rate_hz + k[0] * phase_error / T_s
+    k1, k2, k3, fll = st.pll_track[0], st.pll_track[1], st.pll_track[2], st.fll_track
+    if st.settling:
+        k = st.pll_stages[st.stage]
+        k1, k2, k3 = k[0], k[1], k[2]
+        fll = st.fll_settle if st.stage == 0 else 0.0
+    st.rate_hz_s += k3 * phase_error / (T_s * T_s)
+    st.rate_hz += k2 * phase_error / T_s + st.rate_hz_s * T_s + fll * freq_error
+    st.doppler_hz = st.rate_hz + k1 * phase_error / T_s
     if st.settling:
         st.code_phase_chips += st.dll_settle * code_err
     else:
         st.code_rate_chips_s += st.dll_track[1] * code_err / T_s
-        st.code_phase_chips += st.dll_track[0] * code_err + 0.0
+        st.code_phase_chips += st.dll_track[0] * code_err
+
+
+@njit(nogil=True)
+def _next_stage(st):
+    """Narrow the carrier loop: by halves, for the rate of a third-order filter is noisier by 2^2.5 each time."""
+    st.stage += 1
+    st.stage_time_s = 0.0
+    if st.stage >= st.n_stages:
+        st.settling = 0
+        if st.m_settle != st.m_track:
+            _reset_moments(st)
 
 
 @njit(nogil=True)
@@ -785,8 +858,11 @@ def _tap(acc, t, norm):
 
 
 @njit(nogil=True)
-def _finish(st, acc, hist, secondary, fs_hz, epoch, corr):
-    """End of an integration: discriminators, loops, lock; fills the EPOCH record and its correlator row."""
+def _finish(st, acc, hist, secondary, fs_hz, epoch, corr, symbols, count):
+    """End of an integration: discriminators, loops, lock; fills the EPOCH record and its correlator row.
+
+    Returns the number of ``symbols``, which grows where synchronisation reveals those of the past.
+    """
     n = st.n_acc
     norm = st.scale / n
     T_s = st.m_total * st.period_s
@@ -822,27 +898,27 @@ def _finish(st, acc, hist, secondary, fs_hz, epoch, corr):
             _false_frequency(st, i1, q1, i2, q2, T_s)
             if st.bump_n * T_s >= 0.1 and st.bump_n >= 4.0 and _bump_decision(st, 1.5):
                 slip = 1
-        st.locked_time_s += T_s
-        if st.settling and st.locked_time_s > st.settle_s and st.phase_locked:
-            st.settling = 0
-            if st.m_settle != st.m_track:
-                _reset_moments(st)
+        st.stage_time_s += T_s
+        if st.settling and st.phase_locked and st.stage_time_s > st.stage_s[st.stage]:
+            _next_stage(st)
     else:
         code_err = _pull_in_code(st, e, late, noise) + rounding
         if st.steered == 0:
             st.code_phase_chips += st.dll_pull * code_err
         _estimate_cn0(st, T_s, fs_hz)
         if st.hist_n == 0:
-            st.hist_period = st.start_period
+            st.hist_period, st.hist_sample = st.start_period, st.start_sample
         if st.kind == KIND_CA:
             hist[st.hist_n, 0], hist[st.hist_n, 1] = p.real, p.imag
             st.hist_n += 1
         else:
             hist[st.hist_n, 0], hist[st.hist_n, 1] = i1, q1
             hist[st.hist_n + 1, 0], hist[st.hist_n + 1, 1] = i2, q2
+            past = HISTORY // 2 + st.hist_n // 2
+            hist[past, 0], hist[past, 1] = st.data_i * st.data_scale / n, st.data_q * st.data_scale / n
             st.hist_n += 2
         if st.hist_n >= (HISTORY if st.kind == KIND_CA else HISTORY // 2):
-            _synchronise(st, hist, secondary, noise)
+            count = _synchronise(st, hist, secondary, noise, symbols, count)
     for t in range(st.n_taps):
         corr[t] = np.complex64(_tap(acc, t, norm))
     epoch.sample_index = st.start_sample
@@ -870,6 +946,7 @@ def _finish(st, acc, hist, secondary, fs_hz, epoch, corr):
     epoch.carrier_lock = st.carrier_lock
     epoch.code_lock = st.code_lock
     epoch.cycle_slip = slip
+    return count
 
 
 @njit(nogil=True)
@@ -947,7 +1024,7 @@ def track_slab(which, xi, xq, first, n_avail, fs_hz, if_hz, pool, tap_q, seconda
     ch : CHANNEL (C,)
         State, changed in place; with ``acc`` float64 (C, 2 K + 4) and ``hist`` float64 (C, HISTORY, 2).
     commands : AIDING (C,)
-    epochs : EPOCH (C, n_max); corr : complex64 (C, n_max, K); symbols : SYMBOL (C, n_max)
+    epochs : EPOCH (C, n_max); corr : complex64 (C, n_max, K); symbols : SYMBOL (C, n_max + HISTORY / 4)
         Outputs; ``counts`` and ``symbol_counts`` int64 (C,) say how many rows are filled.
     """
     n_columns = tap_q.shape[1]
@@ -1002,7 +1079,9 @@ def track_slab(which, xi, xq, first, n_avail, fs_hz, if_hz, pool, tap_q, seconda
             if st.m_done >= st.m_total:
                 if st.doppler_rate_hz_s != 0.0:
                     st.doppler_hz += st.doppler_rate_hz_s * st.n_acc / fs_hz
-                _finish(st, acc[c], hist[c], secondary, fs_hz, epochs[c, k], corr[c, k])
+                n_symbols = _finish(
+                    st, acc[c], hist[c], secondary, fs_hz, epochs[c, k], corr[c, k], symbols[c], n_symbols
+                )
                 st.m_done, st.n_acc = 0, 0
                 k += 1
         counts[c] = k
