@@ -5,6 +5,7 @@ import math
 import naive_twin
 import numpy as np
 import pytest
+from scipy import fft as sp_fft
 from scipy import stats
 
 from monitors.fft import FftMonitor
@@ -12,7 +13,7 @@ from monitors.glrt import GlrtMonitor
 from monitors.multichannel_ar import MultichannelAr
 from signals.modulation import autocorrelation
 from signals.multipath import Echoes
-from tracking.correlator_model import Twin, TwinCW, code_spectrum, noise_sigma
+from tracking.correlator_model import Twin, TwinCW, TwinNBI, code_spectrum, noise_sigma
 from tracking.twin_kernels import normals_columns
 
 Z = 5.0
@@ -142,3 +143,34 @@ def test_multipath_distortion_of_the_taps(quiet):
     step = 1.023e6 / fs_hz  # staircase: slope 3 of BOC times half a sample, blurred by the phases
     assert np.max(np.abs(samples - twin)) < error + 0.5 * step
     assert abs(code_spectrum(spec.signal, spec.prn, 0, spec.waveform)) < 0.01
+
+
+@pytest.mark.parametrize("bandwidth_hz", [1e3, 1e4, 1e5, 1e6])
+def test_narrow_band_noise_power(bandwidth_hz):
+    """Mean tap power of flat Gaussian noise around the line, 1 kHz to 1 MHz, from samples and from the twin."""
+    fs_hz, n_epochs = 4.096e6, 2048
+    settings = {"signal": "L1CA", "prn": 6, "cn0_dbhz": 80.0, "integration_s": 1e-3}
+    twin = Twin(**settings, jammers=(TwinNBI(js_db=20.0, bandwidth_hz=bandwidth_hz),))
+    d = twin.tap_array_chips
+    z = twin.start_open(1)(n_epochs) - autocorrelation("L1CA", 6, d)
+    n = 4096 * n_epochs
+    step_hz = fs_hz / n
+    band = np.arange(
+        math.ceil((227e3 - bandwidth_hz / 2) / step_hz), math.floor((227e3 + bandwidth_hz / 2) / step_hz)
+    )
+    rng = np.random.default_rng(2)
+    spectrum = np.zeros(n, np.complex64)
+    g = rng.standard_normal((2, len(band)), np.float32)
+    spectrum[band % n] = (g[0] + 1j * g[1]) * np.float32(10.0 / math.sqrt(2 * len(band)) * n)
+    x = sp_fft.ifft(spectrum, overwrite_x=True).reshape(n_epochs, 4096)
+    t = np.arange(4096) / fs_hz
+    replicas = np.stack([naive_twin.code_at("L1CA", 6, "BPSK", 1.023e6 * t + tap) for tap in d])
+    y = x @ (replicas.T / 4096).astype(np.complex64)
+    power = [np.mean(np.abs(v) ** 2) for v in (y, z)]
+    # Independent values of the mean: epochs times what the band holds of 1 / T, taps counted once. The lines of a code
+    # sampled at one phase differ by up to 5 % from the ideal ones (interference note).
+    independent = n_epochs * min(1.0, bandwidth_hz * 1e-3)
+    assert power[0] == pytest.approx(power[1], rel=Z * math.sqrt(2 / independent) + 0.05)
+    # Epoch-to-epoch correlation agrees too: it is real below 1 / T, and none is left above.
+    lag = [np.mean(v[1:] * v[:-1].conj()) / p for v, p in zip((y, z), power)]
+    assert abs(lag[0] - lag[1]) < Z * math.sqrt(2 / independent)
