@@ -66,9 +66,9 @@ NOISE, CLOCK, SKY, JAMMERS, MULTIPATH, SENSORS = range(6)
 
 def source(spec: Scenario, threads: int = 1) -> SyntheticSource:
     """The samples of a scenario."""
-    sky = spec.sky.start(
-        spec.motion.start(), spec.clock.start(_child(spec, CLOCK), spec.duration_s), spec.duration_s, _child(spec, SKY)
-    )
+    motion = spec.motion.start(spec.duration_s)
+    clock = spec.clock.start(_child(spec, CLOCK), spec.duration_s, motion)
+    sky = spec.sky.start(motion, clock, spec.duration_s, _child(spec, SKY))
     return SyntheticSource(sky, spec.front_end, spec.duration_s, _child(spec, NOISE), threads=threads)
 
 
@@ -178,7 +178,8 @@ def _sentence(model: type[BaseModel], err: ValidationError) -> str:
     else:
         value = first.get("input")
         shown = f" = {value!r}" if isinstance(value, str | int | float | bool) else ""
-        text = f"'{where}'{shown}: {message[0].lower() + message[1:]}"
+        # pydantic's own messages begin with a capital; ours may begin with PLL.
+        text = f"'{where}'{shown}: {message if message[:2].isupper() else message[0].lower() + message[1:]}"
     return text + (f" (and {len(rest)} more such error{'s' * (len(rest) > 1)})" if rest else "")
 
 
