@@ -35,7 +35,7 @@ def test_clopper_pearson_against_its_definition():
     assert binom.sf(2, 20, low) == pytest.approx(0.025, rel=1e-6)
     assert binom.cdf(3, 20, high) == pytest.approx(0.025, rel=1e-6)
     assert reproduce.clopper_pearson(0, 10) == (0.0, pytest.approx(1 - 0.025 ** (1 / 10)))
-    with pytest.raises(ValueError, match="k"):
+    with pytest.raises(ValueError, match="events"):
         reproduce.clopper_pearson(3, 2)
 
 

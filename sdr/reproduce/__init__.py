@@ -8,6 +8,20 @@ import csv
 import json
 from pathlib import Path
 
+from monitors.detection import clopper_pearson
+
+__all__ = [
+    "COLUMNS",
+    "VERDICTS",
+    "clopper_pearson",
+    "format_table",
+    "new_figure",
+    "row",
+    "save_figure",
+    "within",
+    "write_table",
+]
+
 VERDICTS = ("reproduced", "not reproduced", "not stated")
 COLUMNS = ("item", "published", "ours", "ci_low", "ci_high", "verdict", "note")
 
@@ -27,18 +41,6 @@ def row(item, published, ours, ci_low=None, ci_high=None, verdict="not stated", 
 def within(published: float, low: float, high: float) -> str:
     """Verdict of a published number against an interval of ours (or of ours against the published one's)."""
     return "reproduced" if low <= published <= high else "not reproduced"
-
-
-def clopper_pearson(k: int, n: int, level: float = 0.95) -> tuple[float, float]:
-    """Exact binomial interval of k hits in n trials (Clopper and Pearson 1934)."""
-    from scipy.stats import beta
-
-    if n < 1 or not 0 <= k <= n:
-        raise ValueError(f"Counts must obey 0 <= k <= n with n >= 1, not k = {k}, n = {n}.")
-    tail = (1 - level) / 2
-    low = 0.0 if k == 0 else float(beta.ppf(tail, k, n - k + 1))
-    high = 1.0 if k == n else float(beta.ppf(1 - tail, k + 1, n - k))
-    return low, high
 
 
 def write_table(rows: list[dict], out_dir: str | Path, name: str) -> Path:
