@@ -1,5 +1,4 @@
-"""Compiled navigation: range prediction, weighted least squares, fault statistics, position-velocity-clock
-filter.
+"""Compiled navigation: range prediction, weighted least squares, fault statistics, Kalman filter.
 
 One satellite is one row. ``second`` is 1 for the system whose receiver bias carries the inter-system bias
 (ISB), else 0. Ranges are pseudoranges already corrected for satellite clock and atmosphere, so that
@@ -24,8 +23,7 @@ N_EKF = 9
 
 @njit(cache=True, nogil=True)
 def predict_ranges(sat_pos, sat_vel, pos, vel, rng, rate, los):
-    """Geometric range, its rate and unit vectors receiver -> satellite, Earth rotation during flight
-    included.
+    """Geometric range, its rate and unit vectors receiver -> satellite, with Earth rotation in flight.
 
     rho = |R3(w tau) s(t_tx) - x(t_rx)|, tau = rho / c (IS-GPS-200, 20.3.3.4.3.4), and its exact derivative
     with respect to reception time: rho' = e . (R v_s - v_r) / (1 - g/c), g = w (e_x s_y - e_y s_x) - e . R
@@ -196,8 +194,7 @@ def solve_velocity(sat_pos, sat_vel, measured_rate, variance, use, pos, vel, dri
 
 @njit(cache=True, nogil=True)
 def exclusion_drop(los, second, variance, residual, use, m, cov, drop):
-    """By how much chi2 falls when row i alone is left out: r_i^2 / (var_i - h_i cov h_i^T); 0 for unused
-    rows.
+    """By how much chi2 falls when row i alone is left out: r_i^2 / (var_i - h_i cov h_i^T).
 
     The leave-one-out identity of linear least squares, so that n sub-solutions cost one. Rows without
     redundancy (denominator < 1e-9 var) get 0: leaving them out changes nothing that could be tested.
@@ -252,8 +249,7 @@ def joseph_scalar(x, p, h, innovation, r, gain):
 
 @njit(cache=True, nogil=True)
 def pvt_predict(x, p, dt_s, accel_psd, clock_f, clock_g, isb_psd):
-    """Time update of the position-velocity-clock filter over dt_s (either sign of dt is refused by the
-    caller).
+    """Time update of the position-velocity-clock filter over dt_s > 0.
 
     Position' = velocity, velocity' = white acceleration (PSD accel_psd, m^2/s^3, each ECEF axis); clock
     two-state with S_f = clock_f (m^2/s) and S_g = clock_g (m^2/s^3) (Brown & Hwang 1997, section 10.3);

@@ -157,8 +157,7 @@ class Hatch:
         self._state = {}
 
     def smooth(self, obs):
-        """Fill ``pseudorange_smoothed_m`` in place; a slip, a lock younger than the last epoch or a gap
-        resets.
+        """Fill ``pseudorange_smoothed_m`` in place; a slip, a lock younger than an epoch or a gap resets.
 
         Returns
         -------

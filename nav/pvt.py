@@ -248,8 +248,7 @@ def chi2_threshold(dof, p_fa):
 
 
 def raim(sats, corrected_m, variance, second, use, estimate_isb, p_fa, start=None):
-    """Least squares with residual test and exclusion of at most the faulty satellites that redundancy can
-    name.
+    """Least squares with residual test and exclusion of the faulty satellites that redundancy can name.
 
     The weighted residual sum of squares is chi-square with n - m degrees of freedom when nothing is wrong
     and the variances are true (Parkinson & Axelrad 1988). Above its p_fa quantile, the satellite whose

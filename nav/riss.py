@@ -1,5 +1,4 @@
-"""Reduced inertial sensor system (RISS): one vertical gyro, two accelerometers and the odometer; its error
-models.
+"""Reduced inertial sensor system (RISS): one gyro, two accelerometers, the odometer; error models.
 
 Mechanisation of seed 003, eq. 1-10, with the signs that the extraction lost:
 
@@ -15,11 +14,9 @@ The nominal state is one float64 array (``N_NOMINAL``,), so that kernels and Pyt
 are the module's upper-case indices. Two forms:
 
 * ``PAPER`` (``Riss11``): velocity is integrated from the odometer's acceleration a_o and the turn rate, so
-that a
-  velocity correction survives; 11 states as printed. A scale factor error at constant speed has no state.
+  that a velocity correction survives; 11 states as printed. A scale factor error at constant speed has no state.
 * ``SCALE`` (``RissSf``, default): v = v_o (1 - s), s the odometer's scale factor error; 9 states, with the
-pitch
-  error as what feeds the vertical channel. Velocity has no state of its own: its error is that of A, s and p.
+  pitch error as what feeds the vertical channel. Velocity has no state: its error is that of A, s and p.
 """
 
 import math
@@ -29,6 +26,7 @@ import numpy as np
 from numba import njit
 from pydantic import BaseModel, ConfigDict, Field
 
+from nav.eskf_kernels import discretise, predict
 from nav.frames import (
     earth_radii,
     ecef_from_geodetic,
@@ -237,6 +235,31 @@ def riss_sf_f(x, scale_rate, gyro_rate, pitch_rate, f):
     f[7, 8] = 1.0
 
 
+@njit(cache=True, nogil=True)
+def riss_epoch(x, form, p, wz, fy, fx, speed, dt_s, filter_s, rates, q_diag, phi, qd):
+    """Predict over one navigation epoch of m sensor intervals: nominal state and P in place.
+
+    Parameters
+    ----------
+    x (19,), form : nominal state;  p (n, n) : covariance of the form's error states
+    wz, fy, fx, speed (m,) : sensors (``riss_step``);  dt_s : one interval
+    rates : 1/tau, (accel, gyro) for PAPER, (scale, gyro, pitch) for SCALE;  q_diag (n,)
+    phi, qd (n, n) : out, the epoch's transition and noise (one step of m dt_s)
+    """
+    m = wz.size
+    turn = 0.0
+    for k in range(m):
+        riss_step(x, form, wz[k], fy[k], fx[k], speed[k], dt_s, filter_s)
+        turn += wz[k] / m
+    f = np.empty(p.shape)
+    if form == SCALE:
+        riss_sf_f(x, rates[0], rates[1], rates[2], f)
+    else:
+        riss11_f(x, turn, rates[0], rates[1], f)
+    discretise(f, q_diag, m * dt_s, phi, qd)
+    predict(p, phi, qd)
+
+
 class _Riss(BaseModel):
     """What both forms share."""
 
@@ -252,6 +275,16 @@ class _Riss(BaseModel):
     def step(self, x, wz, fy, fx, speed_mps, dt_s):
         """Advance the nominal state in place; see ``riss_step``."""
         riss_step(x, self.form_code, wz, fy, fx, speed_mps, dt_s, self.pitch_filter_s)
+
+    def epoch(self, x, p, wz, fy, fx, speed_mps, dt_s):
+        """Predict state x and covariance p in place over m sensor intervals; returns (Phi, Qd) of the
+        epoch."""
+        phi, qd = np.empty_like(p), np.empty_like(p)
+        riss_epoch(
+            x, self.form_code, p, wz, fy, fx, speed_mps, dt_s, self.pitch_filter_s, self.rates_per_s,
+            self.q_diag(x), phi, qd,
+        )  # fmt: skip
+        return phi, qd
 
     def inject(self, x, dx):
         """Nominal state corrected by dx = true - estimate (a new array)."""
@@ -325,6 +358,11 @@ class Riss11(_Riss):
     def idx_d(self) -> int:
         """Index of the clock drift."""
         return 10
+
+    @property
+    def rates_per_s(self) -> np.ndarray:
+        """1/tau of the odometer acceleration and the gyro bias."""
+        return np.array([1.0 / self.accel_tau_s, 1.0 / self.gyro_tau_s])
 
     def f_matrix(self, x, wz):
         """F (11, 11) at a nominal state and the gyro reading wz (up, rad/s)."""
@@ -410,6 +448,11 @@ class RissSf(_Riss):
         """Index of the clock drift."""
         return 8
 
+    @property
+    def rates_per_s(self) -> np.ndarray:
+        """1/tau of the scale factor, the gyro bias and the pitch error."""
+        return np.array([1.0 / self.scale_tau_s, 1.0 / self.gyro_tau_s, 1.0 / self.pitch_tau_s])
+
     def f_matrix(self, x, wz=0.0):
         """F (9, 9) at a nominal state (the gyro reading does not enter)."""
         f = np.empty((9, 9))
@@ -439,8 +482,7 @@ class RissSf(_Riss):
 
 
 def speed_at(odometer_rows, t_s):
-    """Odometer speed at IMU times, linear between rows (an odometer slower than the IMU is late by one
-    interval).
+    """Odometer speed at IMU times, linear between rows (a slow odometer is late by one interval).
 
     Raises
     ------

@@ -1,5 +1,4 @@
-"""Recorded inertial and odometer data as CSV: one header line, the columns below in this order, one row
-per output.
+"""Recorded inertial and odometer data as CSV: a header line, then one row per output.
 
 IMU: ``t_s, gyro_x_rad_s, gyro_y_rad_s, gyro_z_rad_s, accel_x_mps2, accel_y_mps2, accel_z_mps2``; axes
 forward, right, down; gravity left in, so that a level vehicle at rest reads accel_z = -9.8; means over the

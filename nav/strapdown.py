@@ -10,6 +10,8 @@ import math
 import numpy as np
 from numba import njit
 
+from nav.errormodels import ecef17_f
+from nav.eskf_kernels import discretise, predict
 from nav.frames import gravity_ecef, rotation_body_to_ned, rotation_ned_to_ecef
 from signals.constants import EARTH_RATE_RAD_S
 
@@ -50,8 +52,10 @@ def rotation_matrix(v, out):
 
 @njit(cache=True, nogil=True)
 def _rotation_average(v, x, out):
-    """Mean of exp([v x] u) x over u in 0..1 into ``out``: x + a v x x + b v x (v x x) (Savage 1998, eq.
-    19)."""
+    """Mean of exp([v x] u) x over u in 0..1 into ``out``: x + a v x x + b v x (v x x).
+
+    The specific force of a turning body in the axes of the interval's start (Groves 2013, section 5.5).
+    """
     t2 = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
     if t2 < 1e-6:
         a, b = 0.5 - t2 / 24.0, 1.0 / 6.0 - t2 / 120.0
@@ -109,6 +113,39 @@ def strapdown(pos, vel, c_be, gyro, accel, dt_s, pos_out, vel_out, c_out):
         pos_out[k], vel_out[k], c_out[k] = pos, vel, c_be
 
 
+@njit(cache=True, nogil=True)
+def ecef17_epoch(pos, vel, c_be, bias, clock, p, gyro, accel, dt_s, rates, q_diag, phi, qd):
+    """Predict the 17-state filter over one navigation epoch of m IMU intervals, in place.
+
+    Parameters
+    ----------
+    pos, vel (3,), c_be (3, 3) : nominal state;  bias (6,) : accelerometer m/s^2, gyro rad/s (measured = true + bias)
+    clock (2,) : bias m, drift m/s;  p (17, 17) : covariance
+    gyro, accel (m, 3) : raw means;  dt_s : one IMU interval
+    rates (2,) : 1/tau of accelerometer and gyro biases, 1/s;  q_diag (17,)
+    phi, qd (17, 17) : out, the epoch's transition and noise (one step of m dt_s with the mean specific force)
+    """
+    m = gyro.shape[0]
+    force, a, g = np.zeros(3), np.empty(3), np.empty(3)
+    middle = np.empty((3, 3))
+    for k in range(m):
+        if k == m // 2:
+            middle[:, :] = c_be
+        for i in range(3):
+            a[i], g[i] = accel[k, i] - bias[i], gyro[k, i] - bias[3 + i]
+            force[i] += a[i] / m
+        strapdown_step(pos, vel, c_be, g, a, dt_s)
+    span = m * dt_s
+    f = np.empty((17, 17))
+    ecef17_f(pos, middle, force, rates[0], rates[1], f)
+    discretise(f, q_diag, span, phi, qd)
+    predict(p, phi, qd)
+    for i in range(3):
+        bias[i] *= math.exp(-rates[0] * span)
+        bias[3 + i] *= math.exp(-rates[1] * span)
+    clock[0] += clock[1] * span
+
+
 def mechanise(pos_ecef_m, vel_ecef_mps, c_be, imu, start_s):
     """Free-inertial navigation through IMU rows from the state at ``start_s``.
 
@@ -132,8 +169,7 @@ def mechanise(pos_ecef_m, vel_ecef_mps, c_be, imu, start_s):
 
 
 def level_from_rest(accel_mps2):
-    """(pitch_rad, roll_rad) from the mean specific force (3,) of a vehicle at rest (Groves 2013, section
-    5.6.2).
+    """(pitch_rad, roll_rad) from the mean specific force (3,) at rest (Groves 2013, section 5.6.2).
 
     Raises
     ------
@@ -151,8 +187,7 @@ def level_from_rest(accel_mps2):
 
 
 def heading_from_gyro(gyro_rad_s, pitch_rad, roll_rad):
-    """Azimuth from the Earth's rate seen at rest (3,): only for gyros far better than 15 deg/h (Groves
-    5.105)."""
+    """Azimuth from the Earth's rate seen at rest (3,): for gyros far better than 15 deg/h."""
     level = rotation_body_to_ned(0.0, pitch_rad, roll_rad) @ np.asarray(gyro_rad_s, float)
     return math.atan2(-level[1], level[0])
 
@@ -163,8 +198,7 @@ def coarse_attitude(lat_rad, lon_rad, heading_rad, pitch_rad=0.0, roll_rad=0.0):
 
 
 def attitude_from_velocity(lat_rad, lon_rad, vel_ecef_mps, min_speed_mps=2.0):
-    """C_be (3, 3) of a land vehicle that moves along its forward axis: heading and pitch from velocity, no
-    roll.
+    """C_be (3, 3) of a land vehicle that moves forward: heading and pitch from velocity, no roll.
 
     Raises
     ------

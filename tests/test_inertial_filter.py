@@ -9,7 +9,7 @@ from nav.errormodels import EcefState, measurement_rows
 from nav.eskf import Eskf, discretise
 from nav.frames import geodetic_from_ecef, rotation_enu_to_ecef
 from nav.imu import DEG_H, MG, ImuSpec, ecef17_of, simulate_imu, true_attitude
-from nav.strapdown import strapdown_step
+from nav.strapdown import ecef17_epoch, strapdown_step
 from signals.trajectory import HighDynamics, Segment, Segments
 
 Z = 5.0
@@ -126,6 +126,38 @@ def test_outage_drift_is_what_the_covariance_predicts():
         size.append(np.linalg.norm(error[:3]))
     assert np.mean(nees) == pytest.approx(3.0, abs=Z * np.sqrt(6.0 / runs))
     assert 0.05 < np.sqrt(np.mean(np.square(size))) < 20.0
+
+
+def test_compiled_epoch_is_the_python_one():
+    """Two IMU intervals in one step of the covariance: nominal state the same, P to the force's change in
+    10 ms."""
+    spec = ImuSpec(grade="tactical")
+    model, motion = ecef17_of(spec), car(10.0)
+    rows = simulate_imu(motion, spec, 3, 1.0)[0][:2]
+    start, (c0,) = motion([0.0]), true_attitude(motion, [0.0], "land")[0]
+    bias = np.array([1e-2, -2e-2, 1e-2, 1e-5, 2e-5, -1e-5])
+    pos, vel, c, clock = (
+        start.pos_ecef_m[0].copy(),
+        start.vel_ecef_mps[0].copy(),
+        c0.copy(),
+        np.array([5.0, 0.3]),
+    )
+    p, phi, qd = np.diag(p0_of(spec)), np.empty((17, 17)), np.empty((17, 17))
+    expected = p.copy()
+    epoch = pos.copy(), vel.copy(), c.copy(), bias.copy(), clock.copy(), p
+    rates = np.array([1 / model.accel_bias_tau_s, 1 / model.gyro_bias_tau_s])
+    ecef17_epoch(
+        *epoch, rows["gyro_rad_s"].copy(), rows["accel_mps2"].copy(), DT, rates, model.q_diag(), phi, qd
+    )
+    for k in range(2):
+        state = EcefState(pos, vel, c, bias[:3], bias[3:], *clock)
+        f, q = discretise(model.f_matrix(state, rows["accel_mps2"][k] - bias[:3]), model.q_diag(), DT)
+        expected = f @ expected @ f.T + q
+        strapdown_step(pos, vel, c, rows["gyro_rad_s"][k] - bias[3:], rows["accel_mps2"][k] - bias[:3], DT)
+    np.testing.assert_array_equal(epoch[0], pos)
+    np.testing.assert_array_equal(epoch[2], c)
+    assert epoch[4][0] == pytest.approx(5.0 + 0.3 * 2 * DT)
+    np.testing.assert_allclose(np.diag(p), np.diag(expected), rtol=1e-4)
 
 
 def test_model_of_an_imu_has_its_noise():

@@ -7,6 +7,7 @@ from naive_riss import aided_run, drive, sensors
 
 from nav import riss
 from nav.errormodels import measurement_rows
+from nav.eskf import discretise
 from nav.frames import earth_radii, ecef_from_geodetic, normal_gravity, rotation_enu_to_ecef
 from nav.imu import ImuSpec, OdometerSpec
 from nav.records import ODOMETER
@@ -198,6 +199,21 @@ def test_paper_form_coasts_worse_and_claims_worse():
     """The 11 states as printed: a few metres, a claim that exceeds the error; reported as they are."""
     rms, _, claimed, _ = coast(riss.Riss11(), P0_PAPER, 4)
     assert 0.4 < rms < 6.0 and claimed > 2.0
+
+
+@pytest.mark.parametrize("model", MODELS, ids=lambda m: m.kind)
+def test_compiled_epoch_is_the_python_one(model):
+    x, p = nominal(), np.diag(np.linspace(1, 2, model.n)) * 1e-6
+    wz, fy, fx, v = np.array([-0.1, -0.12]), np.array([0.3, 0.31]), np.zeros(2), np.array([10.0, 10.01])
+    y, q = x.copy(), p.copy()
+    phi, _ = model.epoch(x, p, wz, fy, fx, v, 0.01)
+    for k in range(2):
+        model.step(y, wz[k], fy[k], fx[k], v[k], 0.01)
+    expected_phi, expected_qd = discretise(model.f_matrix(y, wz.mean()), model.q_diag(y), 0.02)
+    np.testing.assert_allclose(x, y, rtol=1e-14)
+    np.testing.assert_allclose(phi, expected_phi, atol=1e-14)
+    # Q's position terms follow the latitude within the epoch: 1e-7 of them.
+    np.testing.assert_allclose(p, expected_phi @ q @ expected_phi.T + expected_qd, rtol=1e-6, atol=1e-20)
 
 
 def test_from_sensors_takes_the_specs_noise():
