@@ -365,9 +365,9 @@ class Tracker:
         T_settle = m_settle * period
         st["m_track"], st["m_settle"] = m_track, m_settle
         bw, stage = min(spec.settle_pll_bw_hz, MAX_BT / T_settle), 0
-        while stage == 0 or (bw > 1.2 * loops.pll_bw_hz and stage < len(st["stage_s"])):
+        while stage == 0 or (bw > loops.pll_bw_hz and stage < len(st["stage_s"])):
             st["pll_stages"][stage] = pll_gains(loops.pll_order, bw, T_settle)
-            st["stage_s"][stage] = spec.settle_s if stage == 0 else 2.0 / bw
+            st["stage_s"][stage] = max(spec.settle_s, 4.0 / bw if stage else 0.0)
             bw, stage = 0.5 * bw, stage + 1
         st["n_stages"] = stage
         st["pll_track"] = pll_gains(loops.pll_order, loops.pll_bw_hz, T_s)

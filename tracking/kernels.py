@@ -161,6 +161,9 @@ CHANNEL = np.dtype(
         ("settling", "i4"),
         ("stage", "i4"),
         ("stage_time_s", "f8"),
+        ("marks", "i4"),
+        ("mark_sample", "i8", 2),
+        ("mark_cycles", "f8", 2),
         ("phase_locked", "i4"),
         ("lock_start_sample", "i8"),
         ("bad_s", "f8"),
@@ -549,7 +552,7 @@ def _noise_power(st):
 def _close_loops(st, sample):
     """Symbols are aligned: from here on the loops run at the settling bandwidths."""
     st.state = STATE_LOCKED
-    st.settling, st.stage, st.stage_time_s = 1, 0, 0.0
+    st.settling, st.stage, st.stage_time_s, st.marks = 1, 0, 0.0, 0
     st.phase_locked = 0
     st.bad_s = 0.0
     st.code_rate_chips_s = 0.0
@@ -818,7 +821,7 @@ def _false_frequency(st, i1, q1, i2, q2, T_s):
     st.rate_hz += f
     st.doppler_hz = st.rate_hz
     st.rate_hz_s = 0.0
-    st.settling, st.stage, st.stage_time_s = 1, 0, 0.0
+    st.settling, st.stage, st.stage_time_s, st.marks = 1, 0, 0.0, 0
     _reset_moments(st)
     return True
 
@@ -842,10 +845,32 @@ def _steer(st, phase_error, freq_error, code_err, T_s):
 
 
 @njit(nogil=True)
-def _next_stage(st):
-    """Narrow the carrier loop: by halves, for the rate of a third-order filter is noisier by 2^2.5 each time."""
+def _settle(st, T_s, fs_hz):
+    """Narrow the carrier loop in stages, each with half the bandwidth of the one before.
+
+    The filter's rate is noisy after a wide stage and a narrow loop would take seconds to forget it, so frequency and
+    rate are set anew from the NCO's phase at the last three thirds of the stage (parabola through three points).
+    """
+    st.stage_time_s += T_s
+    third = st.stage_s[st.stage] / 3.0
+    if st.phase_locked == 0:
+        st.marks = 0
+        return
+    since = st.stage_time_s if st.marks == 0 else (st.next_sample - st.mark_sample[st.marks - 1]) / fs_hz
+    if since < third:
+        return
+    if st.marks < 2:
+        st.mark_sample[st.marks], st.mark_cycles[st.marks] = st.next_sample, st.carrier_cycles
+        st.marks += 1
+        return
+    t01, t12 = (st.mark_sample[1] - st.mark_sample[0]) / fs_hz, since
+    d01 = (st.mark_cycles[1] - st.mark_cycles[0]) / t01
+    d12 = (st.carrier_cycles - st.mark_cycles[1]) / t12
+    a = 2.0 * (d12 - d01) / (t01 + t12)
+    st.rate_hz = d12 + 0.5 * a * t12
+    st.rate_hz_s = a if st.pll_track[2] != 0.0 else 0.0
     st.stage += 1
-    st.stage_time_s = 0.0
+    st.stage_time_s, st.marks = 0.0, 0
     if st.stage >= st.n_stages:
         st.settling = 0
         if st.m_settle != st.m_track:
@@ -898,9 +923,8 @@ def _finish(st, acc, hist, secondary, fs_hz, epoch, corr, symbols, count):
             _false_frequency(st, i1, q1, i2, q2, T_s)
             if st.bump_n * T_s >= 0.1 and st.bump_n >= 4.0 and _bump_decision(st, 1.5):
                 slip = 1
-        st.stage_time_s += T_s
-        if st.settling and st.phase_locked and st.stage_time_s > st.stage_s[st.stage]:
-            _next_stage(st)
+        if st.settling and st.steered == 0:
+            _settle(st, T_s, fs_hz)
     else:
         code_err = _pull_in_code(st, e, late, noise) + rounding
         if st.steered == 0:
