@@ -160,6 +160,11 @@ class Eskf:
         self._count = 0
 
     @property
+    def n_rows(self) -> int:
+        """Measurement rows of every update."""
+        return self._ring.r.shape[1]
+
+    @property
     def n_logged(self) -> int:
         """Epochs now in the ring."""
         return min(self._count, self._ring.t_s.size)
