@@ -5,16 +5,37 @@ how trials are shared out. Use different roots for training, threshold and evalu
 """
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 
+from monitors.baselines import AdcHistogram, AgcGain, Cn0Drop, NoiseFloor, SignalQuality
+from monitors.fft import FftMonitor
+from monitors.glrt import GlrtMonitor
+from monitors.multichannel_ar import MultichannelAr
 from signals.constants import METRES_PER_CHIP, WAVELENGTH_M
 from signals.modulation import SIGNALS
 from tracking.correlator_model import TwinCW, jammer_hz
 from tracking.twin_kernels import hatch_smooth
 
 _PART = 16_384  # monitor epochs at a time: bounds the memory of a long trial
-__all__ = ["TrialResult", "simulate_points", "simulate_trial", "sum_dumps", "train_monitors", "trial_seed"]
+__all__ = [
+    "MonitorSpec",
+    "TrialResult",
+    "simulate_points",
+    "simulate_trial",
+    "sum_dumps",
+    "train_monitors",
+    "trial_seed",
+]
+
+
+MonitorSpec = Annotated[
+    FftMonitor | GlrtMonitor | MultichannelAr | Cn0Drop | NoiseFloor | SignalQuality | AgcGain | AdcHistogram,
+    Field(discriminator="kind"),
+]
+"""A section ``monitors`` of a scenario: any interference monitor. ``kind`` names it."""
 
 
 @dataclass(frozen=True)

@@ -45,7 +45,7 @@ class Rate:
     confidence: float = 0.95
 
     def __str__(self):
-        return f"{self.k}/{self.n} = {self.p:.3g} [{self.low:.2g}, {self.high:.2g}], n_eff {self.n_effective:.0f}"
+        return f"{self.k}/{self.n} = {self.p:.3g} [{self.low:.3g}, {self.high:.3g}], n_eff {self.n_effective:.0f}"
 
 
 def clopper_pearson(k, n, confidence=0.95):
@@ -70,7 +70,7 @@ def rate(k, n, confidence=0.95):
     return Rate(int(k), int(n), k / n if n else math.nan, low, high, float(n), confidence)
 
 
-def cluster_rate(k, n, seed, confidence=0.95, n_boot=2000):
+def cluster_rate(k, n, seed, confidence=0.95, n_boot=2000, per_run=1.0):
     """Rate from runs whose epochs depend on one another: bootstrap over runs.
 
     Parameters
@@ -78,12 +78,15 @@ def cluster_rate(k, n, seed, confidence=0.95, n_boot=2000):
     k, n : int (runs,)
         Events and trials of each run.
     seed : int or SeedSequence
+    per_run : float
+        Independent trials that every run certainly holds (its length over the correlation time); used
+        without events.
 
     Notes
     -----
-    Percentile bootstrap of sum k / sum n; n_effective = p (1 - p) / variance, at most n. Without events, or
-    with fewer than 5 runs that have any, it falls back to Clopper-Pearson on effective numbers: then one run
-    counts for one trial unless runs without events show otherwise.
+    Percentile bootstrap of sum k / sum n; n_effective = p (1 - p) / variance, at most n. With fewer than 5
+    runs that have events it is the Clopper-Pearson interval of the share of such runs times their mean rate;
+    without events, that of zero in runs times ``per_run`` trials.
     """
     k, n = np.asarray(k), np.asarray(n)
     if len(k) != len(n) or len(k) < 2:
@@ -98,7 +101,10 @@ def cluster_rate(k, n, seed, confidence=0.95, n_boot=2000):
         share = p / (hit_runs / len(k)) if hit_runs else 1.0
         if hit_runs and total_k < total_n:
             return Rate(total_k, total_n, p, low * share, min(1.0, high * share), float(len(k)), confidence)
-        return Rate(total_k, total_n, p, low, high, float(len(k)), confidence)
+        effective = min(float(total_n), len(k) * per_run)
+        if not hit_runs:
+            low, high = clopper_pearson(0, effective, confidence)
+        return Rate(total_k, total_n, p, low, high, effective, confidence)
     rng = np.random.Generator(np.random.Philox(seed))
     pick = rng.integers(0, len(k), (n_boot, len(k)))
     boot = k[pick].sum(axis=1) / n[pick].sum(axis=1)

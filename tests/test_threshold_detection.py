@@ -146,6 +146,8 @@ def test_cluster_bootstrap_sees_the_correlation():
     nothing = detection.cluster_rate(np.zeros(20, int), np.full(20, 1000), 1)
     assert nothing.high == pytest.approx(detection.clopper_pearson(0, 20)[1])
     assert nothing.n_effective == 20
+    more = detection.cluster_rate(np.zeros(20, int), np.full(20, 1000), 1, per_run=50)
+    assert more.high == pytest.approx(detection.clopper_pearson(0, 1000)[1])
     with pytest.raises(ValueError, match="at least two"):
         detection.cluster_rate([1], [10], 1)
 
