@@ -20,6 +20,12 @@ STEER_ABOVE_M = 1e-4 * C_MPS
 """The receiver time is stepped when its clock bias exceeds 0.1 ms (and once, at the first fix)."""
 FIRST_SIGMA_M = 100.0
 """Range sigma of the very first pass, where neither elevation nor atmosphere is known."""
+KLOBUCHAR_DEFAULT = (
+    np.array([0.1118e-7, -0.7451e-8, -0.5961e-7, 0.1192e-6]),
+    np.array([0.1167e6, -0.2294e6, -0.1311e6, 0.1049e7]),
+)
+"""GPS broadcast of 2004-01-01, RTKLIB's stand-in too, until parameters are decoded: GPS sends them once in 12.5
+minutes, Galileo never (its own are for NeQuick). Half of a day-time delay is better than none of it."""
 RESTART_AFTER = 3
 """Epochs in a row with fewer than half of the ranges accepted, after which the filter starts afresh."""
 
@@ -123,7 +129,7 @@ class Navigator:
         self.innovations = np.zeros((0, 3))
         self._smoothing = np.ones(0)
         self._steered_m = 0.0
-        self._state = None  # (5,) last position, bias, ISB
+        self._state: np.ndarray | None = None  # (5,) last position, bias, ISB
         self._vel = np.zeros(3)
         self._isb_known = False
         self._x = np.zeros(kernels.N_EKF)
@@ -173,7 +179,9 @@ class Navigator:
         obs = observables(timed, self.clock)
         smoothing = self.hatch.smooth(obs)
         newest = {(e["system"], int(e["prn"])): i for i, e in enumerate(ephemeris)}
-        keep, index, dropped = [], [], []
+        keep: list[int] = []
+        index: list[int] = []
+        dropped: list[str] = []
         for i in np.argsort(-obs["cn0_dbhz"], kind="stable"):
             key = (obs["system"][i], int(obs["prn"][i]))
             why = self._unfit(obs[i], ephemeris[newest[key]] if key in newest else None)
@@ -214,8 +222,8 @@ class Navigator:
             return None
         row = None if iono_utc_gps is None else np.atleast_1d(iono_utc_gps)[0]
         if row is None or not row["beta"].any():  # a row may hold other parameters than these
-            self.notes.append("ionosphere not corrected: its GPS parameters are not decoded yet")
-            return None
+            self.notes.append("ionosphere corrected with default parameters: GPS's are not decoded yet")
+            return KLOBUCHAR_DEFAULT
         return row["alpha"], row["beta"]
 
     def _second(self, obs, eph, iono_utc_galileo):
@@ -237,7 +245,7 @@ class Navigator:
             return second, none, bool(second.any())
         if galileo.all() or not galileo.any():
             return none, none, False
-        if self._isb_known and obs.size < 5:
+        if self._isb_known and self._state is not None and obs.size < 5:
             return none, galileo * -self._state[4], False
         return galileo.astype(float), none, True
 
@@ -324,7 +332,7 @@ class Navigator:
         first = self._state is None
         if estimate and fix.n_unknowns == 5:
             self._isb_known = True
-        elif self._isb_known:
+        elif self._isb_known and self._state is not None:
             state[4] = self._state[4]
         if first or abs(state[3]) > STEER_ABOVE_M:
             self._steer(state[3], first)
@@ -344,7 +352,9 @@ class Navigator:
         ms, frac_s = self.clock.read(sample)
         row["sample_index"], row["t_s"] = sample, sample / self.fs_hz
         row["tow_s"] = (ms * 1e-3 + (frac_s - state[3] / C_MPS)) % SECONDS_PER_WEEK
-        row["week"] = int(eph["week"][0]) + round((float(eph["toe_s"][0]) - row["tow_s"]) / SECONDS_PER_WEEK)
+        row["week"] = int(eph["week"][0]) + round(
+            (float(eph["toe_s"][0]) - float(row["tow_s"])) / SECONDS_PER_WEEK
+        )
         row["pos_ecef_m"], row["vel_ecef_mps"] = state[:3], vel
         row["clock_bias_m"], row["clock_drift_mps"] = state[3] + self._steered_m, drift
         row["cov_ecef_m2"] = cov
