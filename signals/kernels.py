@@ -186,12 +186,13 @@ def _rotations(rot_i, rot_q, carrier, amplitude, n_start, n_cell):
     n_sub = len(rot_i) // max(len(carrier), 1)
     for c in range(len(carrier)):
         p0, p1, p2, p3 = carrier[c, 0], carrier[c, 1], carrier[c, 2], carrier[c, 3]
-        a0, a1 = amplitude[c, 0], amplitude[c, 1]
+        a0, a1, b0, b1 = amplitude[c, 0], amplitude[c, 1], amplitude[c, 2], amplitude[c, 3]
         for j in range(n_sub):
             x = (n_start + SUB // 2 + SUB * j) / n_cell
             re, im = _cis(p0 + x * (p1 + x * (p2 + x * p3)))
-            rot_i[c * n_sub + j] = _F((a0 + x * a1) * re)
-            rot_q[c * n_sub + j] = _F((a0 + x * a1) * im)
+            a, b = a0 + x * a1, b0 + x * b1
+            rot_i[c * n_sub + j] = _F(a * re - b * im)
+            rot_q[c * n_sub + j] = _F(a * im + b * re)
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST)
@@ -385,7 +386,8 @@ def synthesise(
     components : COMPONENT (C,)
     code, carrier : float64 (C, 4)
         Code phase in chips and carrier phase in cycles (IF included): polynomials in x, 0 <= x < 1 over the cell.
-    amplitude : float64 (C, 2)
+    amplitude : float64 (C, 4)
+        Complex amplitude (re0 + x re1) + i (im0 + x im1).
     period : int64 (C,)
         Code period to which ``code[:, 0]`` belongs.
     codes, symbols : int8

@@ -100,6 +100,35 @@ PVT_TRUTH = np.dtype(
 )
 """Truth of the receiver."""
 
+JAMMER_TRUTH = np.dtype(
+    [
+        ("sample_index", "u8"),
+        ("t_s", "f8"),
+        ("jammer", "i4"),  # place in the scenario's list
+        ("kind", "S15"),
+        ("on", "?"),
+        ("freq_hz", "f8"),  # of the centre at this sample, offset from the carrier
+        ("bandwidth_hz", "f8"),  # about that centre, 0 for a tone; a swept tone: of the sweep
+        ("jn0_dbhz", "f8"),  # power over thermal noise density (pulsed: while a pulse lasts); -inf while off
+        ("js_db", "f8"),  # power over that of the satellite it was set against, when it began; NaN: none
+    ]
+)
+"""Truth of one jammer at one sample."""
+
+ECHO_TRUTH = np.dtype(
+    [
+        ("sample_index", "u8"),
+        ("t_s", "f8"),
+        ("prn", "i4"),
+        ("system", "S1"),
+        ("echo", "i4"),  # place in the list of the satellite's echoes
+        ("delay_s", "f8"),  # excess over the direct signal
+        ("power_db", "f8"),  # relative to the direct signal, -inf while it is hidden
+        ("phase_rad", "f8"),  # carrier phase minus that of the direct signal
+    ]
+)
+"""Truth of one echo at one sample."""
+
 CODE_LINE = np.dtype(
     [
         ("signal", "S4"),

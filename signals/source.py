@@ -2,7 +2,7 @@
 
 import math
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from fractions import Fraction
 
@@ -15,10 +15,11 @@ from signals.inav import encode as encode_inav
 from signals.kernels import COMPONENT, synthesise, synthesise_int8
 from signals.lnav import encode as encode_lnav
 from signals.modulation import BLOCK, code_table
-from signals.records import EPHEMERIS, TRUTH
+from signals.multipath import EchoRun
+from signals.records import ECHO_TRUTH, EPHEMERIS, JAMMER_TRUTH, TRUTH
 from signals.sky import Propagation, Satellite, Sky
 
-__all__ = ["CELLS_PER_S", "SyntheticSource", "amplitude", "truth"]
+__all__ = ["CELLS_PER_S", "SyntheticSource", "amplitude", "hermite_cells", "truth"]
 
 CELLS_PER_S = 50
 """Cells of 20 ms: a whole number of code periods of every signal, and the grid of the clock noise."""
@@ -63,6 +64,8 @@ class SyntheticSource:
         False leaves the thermal noise out.
     code_path : optional
         Directory of the E1 codes (``signals.codes.primary_code``).
+    echoes : mapping, optional
+        Satellite name -> EchoRun; each echo is one more component of the synthesis.
     """
 
     def __init__(
@@ -75,6 +78,7 @@ class SyntheticSource:
         threads: int = 1,
         noise: bool = True,
         code_path=None,
+        echoes: Mapping[str, EchoRun] | None = None,
     ):
         self.sky, self.spec = sky, front_end
         self.fs_hz, self.if_hz, self.complex = front_end.fs_hz, front_end.if_hz, front_end.complex
@@ -92,6 +96,9 @@ class SyntheticSource:
         self._seed = seed.generate_state(1, np.uint64)[0]
         self._sigma = np.float32(1.0 if noise else 0.0)
         self._codes, self._components = _code_buffer(sky.satellites, self.fs_hz, code_path)
+        self.echoes = {row: run for row, s in enumerate(sky.satellites) if (run := (echoes or {}).get(s.name))}
+        rows = [np.full(run.n_echo, row) for row, run in self.echoes.items()]
+        self._rows = np.concatenate([np.arange(len(sky.satellites)), *rows]).astype(np.int64)
         self._segment = (-1, np.zeros(0, np.int8), self._components)
         self.front_end = front_end.start(self._rms(duration_s))
         self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
@@ -134,6 +141,29 @@ class SyntheticSource:
         out = self.sky.receiver(index / self.fs_hz)
         out["sample_index"] = index
         return out
+
+    def jammer_truth(self, sample_index) -> np.ndarray:
+        """JAMMER_TRUTH rows of the jammers at these samples, by sample."""
+        rows = [j.truth(sample_index, k) for k, j in enumerate(self.jammers) if hasattr(j, "truth")]
+        return np.stack(rows, axis=1).ravel() if rows else np.zeros(0, JAMMER_TRUTH)
+
+    def echo_truth(self, sample_index) -> np.ndarray:
+        """ECHO_TRUTH rows at these samples, by satellite and sample."""
+        index = np.atleast_1d(np.asarray(sample_index, np.uint64))
+        rows = [np.zeros(0, ECHO_TRUTH)]
+        for row, run in self.echoes.items():
+            satellite = self.sky.satellites[row]
+            for k, i in enumerate(index):
+                t_s = i / self.fs_hz
+                gain, delay_s = run.series(t_s, 1.0, 1)
+                part = np.zeros(run.n_echo, ECHO_TRUTH)
+                part["sample_index"], part["t_s"], part["prn"] = i, t_s, satellite.prn
+                part["system"], part["echo"] = satellite.system.encode(), np.arange(run.n_echo)
+                part["delay_s"], part["phase_rad"] = delay_s[:, 0], np.angle(gain[:, 0])
+                with np.errstate(divide="ignore"):
+                    part["power_db"] = 20 * np.log10(np.abs(gain[:, 0]))
+                rows.append(part)
+        return np.concatenate(rows)
 
     def truth_index(self, rate_hz: float = 10.0) -> np.ndarray:
         """Samples at which truth is written: every 1 / rate_hz from the first, uint64."""
@@ -186,16 +216,37 @@ class SyntheticSource:
         """
         cells = np.arange(cell, min(cell + CELLS_PER_S, self._n_cells))
         sky = self.sky.propagate(np.append(cells, cells[-1] + 1) / CELLS_PER_S)
-        code = -CHIP_RATE_HZ * _hermite(sky.delay_s, sky.delay_rate_s_s)
+        code = -CHIP_RATE_HZ * hermite_cells(sky.delay_s, sky.delay_rate_s_s)
         code[..., 1] += _CELL_CHIPS
-        carrier = -F_L1_HZ * _hermite(sky.phase_delay_s, sky.phase_delay_rate_s_s)
+        carrier = -F_L1_HZ * hermite_cells(sky.phase_delay_s, sky.phase_delay_rate_s_s)
         carrier[..., 0] += np.mod(cells * math.fmod(self.if_hz / CELLS_PER_S, 1.0), 1.0)[:, None]
         carrier[..., 0] -= np.floor(carrier[..., 0])
         carrier[..., 1] += self.if_hz / CELLS_PER_S
         ends = amplitude(sky.cn0_dbhz, self.fs_hz, self.complex).T
         seen = (sky.visible[:, :-1] & sky.visible[:, 1:]).T
-        gain = np.stack([ends[:-1], ends[1:] - ends[:-1]], axis=-1) * seen[..., None]
-        return code, carrier, gain
+        gain = np.stack([ends[:-1], ends[1:] - ends[:-1], *[np.zeros_like(ends[1:])] * 2], axis=-1)
+        return self._with_echoes(cells, code, carrier, gain * seen[..., None])
+
+    def _with_echoes(self, cells, code, carrier, gain) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The same, and after the satellites their echoes: later codes, gains on lines, Doppler in the carrier."""
+        parts = [(code, carrier, gain)]
+        t_s = np.append(cells, cells[-1] + 1) / CELLS_PER_S
+        for row, run in self.echoes.items():
+            echo, delay_s = run.series(t_s[0], 1 / CELLS_PER_S, len(t_s))
+            turns = np.mod(run.doppler_hz[:, None] * t_s, 1.0)
+            slow = (echo * np.exp(-2j * np.pi * turns)).T
+            later = np.zeros((len(cells), run.n_echo, 4))
+            later[..., 0], later[..., 1] = delay_s.T[:-1], np.diff(delay_s.T, axis=0)
+            spin = np.zeros_like(later)
+            spin[..., 0], spin[..., 1] = turns.T[:-1], run.doppler_hz / CELLS_PER_S
+            begin = gain[:, row, :1] * slow[:-1]
+            change = (gain[:, row, :1] + gain[:, row, 1:2]) * slow[1:] - begin
+            parts.append((
+                code[:, row, None] - CHIP_RATE_HZ * later,
+                carrier[:, row, None] + spin,
+                np.stack([begin.real, change.real, begin.imag, change.imag], axis=-1),
+            ))  # fmt: skip
+        return tuple(np.concatenate(p, axis=1) for p in zip(*parts)) if self.echoes else parts[0]
 
     def _symbols(self, segment: int) -> tuple[np.ndarray, np.ndarray]:
         """Flat symbols of a segment and the components that point into them."""
@@ -210,7 +261,7 @@ class SyntheticSource:
                     components[f"periods_per_symbol{k}"][row] = periods
                     parts.append(values)
                     at += len(values)
-            self._segment = (segment, np.concatenate(parts), components)
+            self._segment = (segment, np.concatenate(parts), components[self._rows])
         return self._segment[1], self._segment[2]
 
     def _make(self, first, last, n_start, components, code, carrier, gain, periods, symbols) -> np.ndarray:
@@ -232,7 +283,7 @@ class SyntheticSource:
         return self.front_end(iq)
 
 
-def _hermite(value: np.ndarray, rate: np.ndarray) -> np.ndarray:
+def hermite_cells(value: np.ndarray, rate: np.ndarray) -> np.ndarray:
     """Cubics in x with the values and rates (per second) of (S, cells + 1) nodes -> (cells, S, 4)."""
     v0, v1 = value.T[:-1], value.T[1:]
     d0, d1 = rate.T[:-1] / CELLS_PER_S, rate.T[1:] / CELLS_PER_S
