@@ -126,7 +126,7 @@ def observables(rows, clock):
         raise ValueError(
             "observables of one epoch must share one sample index; take all channels at one sample."
         )
-    for name in TRANSMIT.names:
+    for name in TRANSMIT.names or ():
         out[name] = known[name]
     out["tow_tx_s"] = known["tow_tx_ms"] * 1e-3 + known["tow_tx_frac_s"]
     rx_ms, rx_frac_s = clock.read(known["sample_index"][0])

@@ -82,8 +82,9 @@ def satellites(obs, eph):
     frac_s = (obs["tow_tx_ms"] - whole_s * 1000) * 1e-3 + obs["tow_tx_frac_s"]
     pos, vel = np.zeros((obs.size, 3)), np.zeros((obs.size, 3))
     clock, rate = np.zeros(obs.size), np.zeros(obs.size)
-    columns = [np.ascontiguousarray(eph[name], dtype=float) for name in ("toe_s", "toc_s", "tgd_s")]
-    _states_kernel(orbit_coefficients(eph), whole_s.astype(float), frac_s, *columns, pos, vel, clock, rate)
+    toe, toc, tgd = (np.ascontiguousarray(eph[name], dtype=float) for name in ("toe_s", "toc_s", "tgd_s"))
+    k = orbit_coefficients(eph)
+    _states_kernel(k, whole_s.astype(float), frac_s, toe, toc, tgd, pos, vel, clock, rate)
     sats["pos_ecef_m"], sats["vel_ecef_mps"], sats["clock_m"], sats["clock_rate_mps"] = pos, vel, clock, rate
     return sats
 
@@ -264,7 +265,8 @@ def raim(sats, corrected_m, variance, second, use, estimate_isb, p_fa, start=Non
     NoFix
         When the test fails and no redundancy is left to exclude with.
     """
-    use, excluded = use.copy(), []
+    use = use.copy()
+    excluded: list[int] = []
     while True:
         fix = solve_position(sats, corrected_m, variance, second, use, estimate_isb, start)
         limit = chi2_threshold(fix.dof, p_fa)

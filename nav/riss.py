@@ -20,7 +20,7 @@ are the module's upper-case indices. Two forms:
 """
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numba import njit
@@ -265,6 +265,17 @@ class _Riss(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
+    form_code: ClassVar[int]
+    """PAPER or SCALE."""
+    n: ClassVar[int]
+    names: ClassVar[tuple[str, ...]]
+    """State names with units."""
+    state_columns: ClassVar[np.ndarray]
+    """Nominal columns that the states correct."""
+    idx_b: ClassVar[int]
+    idx_d: ClassVar[int]
+    """Indices of clock bias and drift."""
+
     gyro_sigma_deg_h: Annotated[float, Field(gt=0)] = 10.0
     gyro_tau_s: Annotated[float, Field(gt=0)] = 3600.0
     pitch_filter_s: Annotated[float, Field(ge=0, le=60)] = 1.0
@@ -275,6 +286,15 @@ class _Riss(BaseModel):
     def step(self, x, wz, fy, fx, speed_mps, dt_s):
         """Advance the nominal state in place; see ``riss_step``."""
         riss_step(x, self.form_code, wz, fy, fx, speed_mps, dt_s, self.pitch_filter_s)
+
+    @property
+    def rates_per_s(self) -> np.ndarray:
+        """1/tau of the model's Gauss-Markov states, for ``riss_epoch``."""
+        raise NotImplementedError
+
+    def q_diag(self, x):
+        """Diagonal of Qc (n,)."""
+        raise NotImplementedError
 
     def epoch(self, x, p, wz, fy, fx, speed_mps, dt_s):
         """Predict state x and covariance p in place over m sensor intervals; returns (Phi, Qd) of the
@@ -320,44 +340,20 @@ class Riss11(_Riss):
     stated there: assumed.
     """
 
+    form_code = PAPER
+    n = 11
+    names = (
+        "dlat_rad", "dlon_rad", "dh_m", "dve_mps", "dvn_mps", "dvu_mps", "da_rad", "dao_mps2", "dbz_rad_s",
+        "b_m", "d_mps",
+    )  # fmt: skip
+    state_columns = PAPER_STATES
+    idx_b, idx_d = 9, 10
+
     kind: Literal["riss11"] = "riss11"
     accel_sigma_mps2: Annotated[float, Field(gt=0)] = 0.002
     accel_tau_s: Annotated[float, Field(gt=0)] = 100.0
     heading_noise_deg_rth: Annotated[float, Field(ge=0)] = 0.0
     velocity_noise_mps2_rthz: Annotated[float, Field(ge=0)] = 0.0
-
-    @property
-    def form_code(self) -> int:
-        """PAPER."""
-        return PAPER
-
-    @property
-    def n(self) -> int:
-        """Number of states."""
-        return 11
-
-    @property
-    def state_columns(self) -> np.ndarray:
-        """Nominal columns that the states correct."""
-        return PAPER_STATES
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """State names with units."""
-        return (
-            "dlat_rad", "dlon_rad", "dh_m", "dve_mps", "dvn_mps", "dvu_mps", "da_rad", "dao_mps2",
-            "dbz_rad_s", "b_m", "d_mps",
-        )  # fmt: skip
-
-    @property
-    def idx_b(self) -> int:
-        """Index of the clock bias."""
-        return 9
-
-    @property
-    def idx_d(self) -> int:
-        """Index of the clock drift."""
-        return 10
 
     @property
     def rates_per_s(self) -> np.ndarray:
@@ -370,7 +366,7 @@ class Riss11(_Riss):
         riss11_f(x, float(wz), 1.0 / self.accel_tau_s, 1.0 / self.gyro_tau_s, f)
         return f
 
-    def q_diag(self, x=None):
+    def q_diag(self, x):
         """Diagonal of Qc (11,)."""
         q = np.zeros(11)
         q[3:6] = self.velocity_noise_mps2_rthz**2
@@ -393,6 +389,12 @@ class RissSf(_Riss):
     The odometer's white noise sigma at rate f enters as position noise of PSD sigma^2 / f; the pitch error
     is the accelerometer bias over g plus what the quasi-static pitch (eq. 2) leaves out.
     """
+
+    form_code = SCALE
+    n = 9
+    names = ("dlat_rad", "dlon_rad", "dh_m", "da_rad", "ds", "dbz_rad_s", "dp_rad", "b_m", "d_mps")
+    state_columns = SCALE_STATES
+    idx_b, idx_d = 7, 8
 
     kind: Literal["riss_sf"] = "riss_sf"
     heading_noise_deg_rth: Annotated[float, Field(ge=0)] = 1.0
@@ -417,36 +419,6 @@ class RissSf(_Riss):
             "odometer_noise_m2_s": odometer.noise_mps**2 / odometer.rate_hz,
         }
         return cls(**(values | other))
-
-    @property
-    def form_code(self) -> int:
-        """SCALE."""
-        return SCALE
-
-    @property
-    def n(self) -> int:
-        """Number of states."""
-        return 9
-
-    @property
-    def state_columns(self) -> np.ndarray:
-        """Nominal columns that the states correct."""
-        return SCALE_STATES
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """State names with units."""
-        return ("dlat_rad", "dlon_rad", "dh_m", "da_rad", "ds", "dbz_rad_s", "dp_rad", "b_m", "d_mps")
-
-    @property
-    def idx_b(self) -> int:
-        """Index of the clock bias."""
-        return 7
-
-    @property
-    def idx_d(self) -> int:
-        """Index of the clock drift."""
-        return 8
 
     @property
     def rates_per_s(self) -> np.ndarray:
