@@ -486,12 +486,12 @@ def _refine(follower, doppler_hz, lag):
     snr = one[0] / n_one / np.mean(noise) - 1
     rate = CHIP_RATE_HZ * (1 + doppler_hz / F_L1_HZ) / plan.fs_hz
     phase = (offset - lag * rate) % follower.tables[0].code_length_chips
-    return doppler_hz, phase, _cn0_dbhz(plan, snr, SIGNALS[plan.signal].code_period_s)
+    return doppler_hz, phase, _cn0_dbhz(snr, SIGNALS[plan.signal].code_period_s)
 
 
-def _cn0_dbhz(plan, snr, coherent_s):
-    """C/N0 of the whole signal from the mean power over noise of a component (E1: two of equal power)."""
-    return 10 * math.log10(max(plan.pad * snr / coherent_s, 1.0))
+def _cn0_dbhz(snr, coherent_s):
+    """C/N0 of one component from its mean power over noise."""
+    return 10 * math.log10(max(snr / coherent_s, 1.0))
 
 
 def _refine_doppler(follower, doppler_hz, lag, offset, periods, stop):
@@ -560,8 +560,8 @@ def acquire(slab_iq, n0, fs_hz, if_hz, signal, prns=None, spec=None, path=None):
     -------
     ndarray ACQUISITION (len(prns),)
         In the order of ``prns``. ``statistic``, ``threshold`` and ``acquired`` of the stage that decided. Code phase
-        holds at n0. ``cn0_dbhz`` is that of the whole satellite signal (E1: both components; reads
-        0.6 to 1.8 dB low, BOC(1,1) replica in 4 MHz). Doppler, code phase
+        holds at n0. ``cn0_dbhz`` is that of the component named (half an E1 signal's power; reads
+        0.6 to 1.8 dB low, BOC(1,1) replica in 4 MHz), as in tracking. Doppler, code phase
         and C/N0 are refined where ``acquired``, else the best cell's (C/N0 NaN). Independent of ``spec.workers``.
 
     Raises
@@ -641,7 +641,7 @@ def _accept(x, found, plan):
     refined = _refine(_Follower(x, found.tables, plan), doppler_hz, lag)
     if refined is None:
         phase = -lag * CHIP_RATE_HZ / plan.fs_hz % found.tables[0].code_length_chips
-        refined = doppler_hz, phase, _cn0_dbhz(plan, found.statistic - 1, plan.hop / plan.fs_hz)
+        refined = doppler_hz, phase, _cn0_dbhz(found.statistic - 1, plan.hop / plan.fs_hz)
     return found._replace(refined=refined)
 
 

@@ -19,7 +19,7 @@ ACQUISITION = np.dtype(
         ("sample_index", "u8"),  # where code_phase_chips holds
         ("doppler_hz", "f8"),
         ("code_phase_chips", "f8"),  # phase of the incoming primary code at sample_index
-        ("cn0_dbhz", "f8"),
+        ("cn0_dbhz", "f8"),  # of the component named in signal
         ("statistic", "f8"),
         ("threshold", "f8"),
         ("acquired", "?"),
@@ -88,7 +88,7 @@ REPLICA = np.dtype(
         ("carrier_phase_cycles", "f8"),
         ("doppler_hz", "f8"),  # of the loop filter (steered: of the NCO)
         ("doppler_rate_hz_s", "f8"),
-        ("cn0_dbhz", "f8"),
+        ("cn0_dbhz", "f8"),  # of the component named in signal
         ("cn0_prompt_dbhz", "f8"),
         ("carrier_lock", "f8"),
         ("code_lock", "f8"),
