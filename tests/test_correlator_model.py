@@ -350,6 +350,58 @@ def test_fading_echo_is_stateless_and_has_its_power():
     assert np.all(np.diff(delay_s[1]) < 0)
 
 
+@pytest.mark.parametrize("base", [GPS, GAL])
+def test_front_end_filter_shapes_signal_and_noise_alike(base):
+    """Brick wall on samples by FFT: mean taps and noise covariance; prompt and floor fall by the power cut off."""
+    band_hz, fs_hz = 4e6, 16.368e6
+    d = (-1.0, -0.5, -0.25, 0.0, 0.25, 0.5, 1.0)
+    settings = {**base, "cn0_dbhz": 45.0, "taps_chips": d, "bandwidth_hz": band_hz}
+    spec = Twin(**settings)
+    waveform = "BPSK" if base is GPS else "BOC11"
+    n = round(fs_hz * (1e-3 if base is GPS else 4e-3))
+    t = np.arange(n) / fs_hz
+    shift = 0.5 * 1.023e6 / fs_hz  # half a sample: the staircase's middle
+    replicas = np.stack(
+        [naive_twin.code_at(base["signal"], base["prn"], waveform, 1.023e6 * t + x + shift) for x in d]
+    )
+    spectrum = np.fft.fft(replicas[3])
+    spectrum[np.abs(np.fft.fftfreq(n, 1 / fs_hz)) > band_hz / 2] = 0
+    direct = replicas @ np.fft.ifft(spectrum).real / n
+    R = spec.autocorrelation(np.array(d))
+    assert np.max(np.abs(direct - R)) < 0.02  # aliases of the sampled code inside the band: sinc at 14 MHz
+    assert R[3] < 0.99
+    z = spec.start_open(1)(20_000)
+    s2 = noise_sigma(45.0, base["integration_s"]) ** 2
+    C = (z - R).T @ (z - R).conj() / len(z) / (2 * s2)
+    expected = spec.autocorrelation(np.subtract.outer(d, d))
+    assert np.max(np.abs(C - expected)) < Z / math.sqrt(len(z))
+    assert np.max(np.abs(z.mean(axis=0) - R)) < Z * math.sqrt(2 * s2 / len(z)) + 1e-6
+    loop, _ = spec.start(1)(3000)
+    assert abs(loop["code_error_chips"][500:].mean()) < 0.01
+    # Infinite band: the table of lines is the piecewise linear function.
+    wide = Twin(**settings | {"bandwidth_hz": 60e6})
+    ideal = Twin(**settings | {"bandwidth_hz": None})
+    assert np.max(np.abs(wide.autocorrelation(d) - ideal.autocorrelation(d))) < 0.02
+
+
+def test_front_end_filter_removes_jammers_outside():
+    base = GPS | {"cn0_dbhz": 80.0, "bandwidth_hz": 2e6}
+    plain = Twin(**base).start_open(3)(2000)
+
+    def added(jammer):
+        return Twin(**base, jammers=(jammer,)).start_open(3)(2000) - plain
+
+    assert np.all(added(TwinCW(js_db=20, freq_hz=1.1e6)) == 0)
+    assert np.all(added(TwinNBI(js_db=20, freq_hz=1.6e6, line="worst", bandwidth_hz=1e6)) == 0)
+    assert np.any(added(TwinCW(js_db=20, freq_hz=0.9e6)) != 0)
+    sweep = np.abs(added(TwinCW(js_db=20, freq_hz=1.0e6 - 100, rate_hz_s=10))).max(axis=1)
+    assert np.max(sweep[501:]) < 1e-6  # another product shape: rounding
+    assert np.max(sweep[450:500]) > 1e-3
+    half = np.mean(np.abs(added(TwinNBI(js_db=20, freq_hz=1e6, bandwidth_hz=4e5))) ** 2)
+    inside = np.mean(np.abs(added(TwinNBI(js_db=20, freq_hz=0.9e6, bandwidth_hz=2e5))) ** 2)
+    assert half == pytest.approx(0.5 * inside, rel=1e-3)
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [

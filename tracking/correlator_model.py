@@ -75,6 +75,7 @@ _MAX_TAPS = 512
 _MAX_TERMS = 512
 _SLOW_BT = 8.0  # up to this B T, narrow-band noise keeps its exact correlation in time and over the taps
 _NBI_BLOCK = 4096  # epochs; overlapped by half
+_FILTERED_PER_CHIP = 64
 _TABLE_CHIPS = {"BPSK": 1, "BOC11": 2, "CBOC+": 12, "CBOC-": 12}
 
 
@@ -177,6 +178,9 @@ class Twin(_Spec):
     fs_hz: float | None = Field(None, gt=1e5)  # jammer lines of the sampled replica, aliases included
     alias_orders: int = Field(8, ge=1, le=64)
     loss_db: float = Field(0.0, ge=0, le=20)  # of the quantiser: raises the noise
+    bandwidth_hz: float | None = Field(
+        None, ge=2e5, le=60e6
+    )  # front-end filter, brick wall, both sides of L1
     jammers: tuple[Interferer, ...] = ()
     multipath: MultipathSpec | None = None
     dynamics: Dynamics = Dynamics()
@@ -212,6 +216,17 @@ class Twin(_Spec):
                 f"integration_s = {self.integration_s:g} spans more than one symbol of "
                 f"{_symbol_s(self.signal):g} s of {self.signal}: shorten it or set data = false"
             )
+
+    def autocorrelation(self, delay_chips):
+        """R(d) after the front-end filter: correlation of the signal, and covariance of the noise, over the
+        taps.
+        """
+        if self.bandwidth_hz is None:
+            return autocorrelation(self.signal, self.prn, delay_chips, self.waveform)
+        table, per_chip = _acf_table(self.signal, self.prn, self.waveform, self.bandwidth_hz)
+        y = np.mod(np.asarray(delay_chips, float) * per_chip, len(table))
+        i = np.floor(y).astype(np.int64)
+        return table[i % len(table)] + (y - i) * (table[(i + 1) % len(table)] - table[i % len(table)])
 
     @property
     def tap_array_chips(self):
@@ -274,27 +289,65 @@ def worst_line(signal, prn, waveform=None):
 
 
 @lru_cache(maxsize=64)
-def _acf_table(signal, prn, waveform):
-    """One period of R and its points per chip; R is linear between them."""
+def _acf_table(signal, prn, waveform, bandwidth_hz=None):
+    """One period of R and its points per chip; R is linear between them.
+
+    Behind a filter R(d) = sum of |c_k|^2 e^{2 pi i k d / L} over the lines that pass; 64 points per chip
+    leave 1e-3.
+    """
     waveform = waveform or SIGNALS[signal].waveform
-    per_chip = _TABLE_CHIPS[waveform]
-    n = SIGNALS[signal].code_length_chips * per_chip
-    table = autocorrelation(signal, prn, np.arange(n) / per_chip, waveform)
+    length = SIGNALS[signal].code_length_chips
+    per_chip = _TABLE_CHIPS[waveform] if bandwidth_hz is None else _FILTERED_PER_CHIP
+    n = length * per_chip
+    if bandwidth_hz is None:
+        table = autocorrelation(signal, prn, np.arange(n) / per_chip, waveform)
+    else:
+        k = np.arange(math.floor(0.5 * bandwidth_hz * SIGNALS[signal].code_period_s) + 1)
+        power = np.zeros(n // 2 + 1)
+        power[k] = np.abs(code_spectrum(signal, prn, k, waveform)) ** 2
+        table = np.fft.irfft(power, n) * n
     table.flags.writeable = False
     return table, per_chip
 
 
 @lru_cache(maxsize=64)
-def _noise_factor(signal, prn, waveform, taps):
+def _noise_factor(signal, prn, waveform, bandwidth_hz, taps):
     """F with F F^T = R(d_i - d_j), float64 (K, K): Cholesky, or the symmetric root where R is singular."""
     d = np.array(taps)
-    R = autocorrelation(signal, prn, d[:, None] - d[None, :], waveform)
+    # Only what R depends on enters, so that twins of other settings share the factor.
+    spec = Twin.model_construct(signal=signal, prn=prn, waveform=waveform, bandwidth_hz=bandwidth_hz)
+    R = spec.autocorrelation(d[:, None] - d[None, :])
     R = 0.5 * (R + R.T)
     try:
         return np.linalg.cholesky(R)
     except np.linalg.LinAlgError:
         value, vector = np.linalg.eigh(R)
         return vector * np.sqrt(np.maximum(value, 0.0))
+
+
+def _passed(spec, jammer):
+    """What of a jammer passes the front-end filter: the jammer with a smaller band or a shorter time, or
+    None.
+    """
+    if spec.bandwidth_hz is None:
+        return jammer
+    edge = 0.5 * spec.bandwidth_hz
+    f = jammer_hz(spec, jammer) + spec.doppler_hz
+    if isinstance(jammer, TwinNBI):
+        low, high = max(f - 0.5 * jammer.bandwidth_hz, -edge), min(f + 0.5 * jammer.bandwidth_hz, edge)
+        if high <= low:
+            return None
+        change = {
+            "js_db": jammer.js_db + 10 * math.log10((high - low) / jammer.bandwidth_hz),
+            "bandwidth_hz": high - low,
+            "offset_hz": jammer.offset_hz + 0.5 * (low + high) - f,
+        }
+        return jammer.model_copy(update=change)
+    if jammer.rate_hz_s == 0.0:
+        return jammer if abs(f) <= edge else None
+    enter, leave = sorted((x - f) / jammer.rate_hz_s for x in (-edge, edge))
+    start, end = max(jammer.start_s, enter), min(jammer.end_s, leave)
+    return jammer.model_copy(update={"start_s": start, "end_s": end}) if start < end else None
 
 
 def _near(periods):
@@ -369,7 +422,8 @@ def _cw_rows(spec, rng):
     """CW jammers as rows (f, rate, phase, amplitude, start, end), aliases of a sampled replica included."""
     rows = []
     for j in spec.jammers:
-        phase = rng.random()
+        phase = rng.random()  # drawn for every jammer: leaving one out does not move the others
+        j = _passed(spec, j)
         if not isinstance(j, TwinCW):
             continue
         phase = phase if j.phase_rad is None else j.phase_rad / (2 * math.pi)
@@ -392,14 +446,17 @@ class _Stage:
         code = SIGNALS[spec.signal]
         self.length = code.code_length_chips
         self.line_hz = 1.0 / code.code_period_s
-        self.acf, self.per_chip = _acf_table(spec.signal, spec.prn, spec.waveform)
+        self.acf, self.per_chip = _acf_table(spec.signal, spec.prn, spec.waveform, spec.bandwidth_hz)
         self.sigma = noise_sigma(spec.cn0_dbhz - spec.loss_db, spec.integration_s)
-        factor = self.sigma * _noise_factor(spec.signal, spec.prn, spec.waveform, tuple(taps.tolist()))
+        factor = self.sigma * _noise_factor(
+            spec.signal, spec.prn, spec.waveform, spec.bandwidth_hz, tuple(taps.tolist())
+        )
         self.factor = factor.astype(np.float32)
         self.key, self.symbol_key, self.wide_key, rng, echo_seed, self.nbi_seed = _keys(seed)
         self.cws = _cw_rows(spec, rng)
         self.echoes = spec.multipath.start(echo_seed) if spec.multipath else None
-        self.nbis = [_nbi(self, i, j) for i, j in enumerate(spec.jammers) if isinstance(j, TwinNBI)]
+        passed = [(i, _passed(spec, j)) for i, j in enumerate(spec.jammers)]
+        self.nbis = [_nbi(self, i, j) for i, j in passed if isinstance(j, TwinNBI)]
         self.hash = np.empty(BLOCK_EPOCHS, np.int32), np.empty(BLOCK_EPOCHS, np.int32)
         self.secondary = secondary_code().astype(np.float32)
 
@@ -565,7 +622,7 @@ class TwinRun:
         T = spec.integration_s
         scale = code_scale_chips(
             spec.code_discriminator,
-            lambda d: autocorrelation(spec.signal, spec.prn, d, spec.waveform),
+            spec.autocorrelation,
             spec.early_late_space_chips,
         )
         gains = pll_gains(spec.pll_order, spec.pll_bandwidth_hz, T)
@@ -769,7 +826,7 @@ class OpenLoopRun:
         self.spec = spec
         self.stage = _Stage(spec, seed, spec.tap_array_chips)
         self.n_taps = len(self.stage.taps)
-        self.R = autocorrelation(spec.signal, spec.prn, self.stage.taps, spec.waveform).astype(np.float32)
+        self.R = spec.autocorrelation(self.stage.taps).astype(np.float32)
         self._key, self._series = None, {}
         self.block_epochs = BLOCK_EPOCHS
 
@@ -791,9 +848,7 @@ class OpenLoopRun:
         self.inner[K, :n], self.inner[K, n:] = direct, 0.0
         row = K + 1
         for g, d in zip(gain, chips):
-            self.left[:, row] = autocorrelation(
-                self.spec.signal, self.spec.prn, s.taps + d[n // 2], self.spec.waveform
-            )
+            self.left[:, row] = self.spec.autocorrelation(s.taps + d[n // 2])
             self.inner[row, :n], self.inner[row, n:] = direct * g.real, direct * g.imag
             row += 1
         shift_s = self.spec.code_phase_chips / CHIP_RATE_HZ
