@@ -199,6 +199,38 @@ def bench(
 
 
 @app.command
+def campaign(
+    file: str,
+    /,
+    *,
+    output: Out = None,
+    workers: Annotated[int | None, Parameter(help="Local processes; the results do not depend on it.")] = None,
+    scheduler: Annotated[str | None, Parameter(help="Dask scheduler, e.g. tcp://127.0.0.1:8786.")] = None,
+    confirm: Annotated[
+        int | None, Parameter(help="Rerun this point on IF samples and say whether the two agree.")
+    ] = None,
+    plots: Annotated[bool, Parameter(negative="", help="Draw the figures beside the results.")] = False,
+    json: Json = False,
+    set_: Set = [],  # noqa: B006
+) -> None:
+    """Count missed detections and false alarms over a grid of settings; goes on where it was stopped.
+
+    FILE is a TOML file or the name of a built-in campaign (see: gnssbb scenarios).
+    """
+    if confirm is not None:
+        from sdr import confirm as confirmer
+
+        _report("campaign", confirmer.confirm(file, confirm, overrides=set_, quiet=json), json)
+        return
+    from sdr import farm
+
+    result = farm.run(
+        file, output=output, workers=workers, scheduler=scheduler, overrides=set_, plots=plots, quiet=json
+    )
+    _report("campaign", result, json)
+
+
+@app.command
 def scenarios(*, json: Json = False) -> None:
     """List the built-in scenarios."""
     from sdr import scenario

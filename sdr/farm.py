@@ -1,0 +1,628 @@
+"""Runs a campaign on processes or on a cluster, with a journal that survives being killed at any moment.
+
+Finished trials are appended to ``OUT.journal`` at once, each chunk framed with its length and checksum; what a
+killed process left torn at the end is cut off. Trials in flight are computed again with the same seeds, and a
+trial that is known already is never counted twice. When the campaign is complete its results are in ``OUT``
+(HDF5) and the journal is gone.
+"""
+
+import concurrent.futures as futures
+import contextlib
+import io
+import json
+import os
+import struct
+import time
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from sdr import store, version
+from sdr.campaign import (
+    THRESHOLD,
+    TRIAL,
+    Campaign,
+    PointCount,
+    evaluate_trials,
+    fit_thresholds,
+    load,
+    quiet_statistics,
+    summarise,
+)
+from sdr.jobs import _progress
+
+CHUNK_S = 1.0
+"""Chunks of trials last about this long, so that handing them out costs nothing."""
+CONNECT_S = 10.0
+_MAGIC = b"gnssbb campaign journal 1\n"
+_FRAME = struct.Struct("<cQI")
+_MAX_FRAME = 1 << 30
+_RETRIES = 3
+
+RATE = np.dtype(
+    [
+        ("point", "i4"),
+        ("monitor", "S16"),
+        ("k", "i8"),
+        ("n", "i8"),
+        ("rate", "f8"),
+        ("ci_low", "f8"),
+        ("ci_high", "f8"),
+        ("n_effective", "f8"),
+        ("trials", "i8"),
+        ("threshold", "f8"),
+        ("stop_reason", "S16"),
+    ]
+)
+"""Summary of one point and monitor."""
+
+
+def run(
+    name: str,
+    *,
+    output: Path | str | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    overrides: Sequence[str] = (),
+    plots: bool = False,
+    quiet: bool = False,
+) -> dict[str, Any]:
+    """Run (or go on with) the campaign ``name`` until every point has stopped."""
+    campaign = load(name, tuple(overrides))
+    path = Path(output) if output else Path(f"{campaign.spec.name}.h5")
+    begin = time.perf_counter()
+    with Results(campaign, path) as results:
+        if not results.complete:
+            with _crew(workers, scheduler, path) as crew:
+                _thresholds(campaign, results, crew, quiet)
+                _evaluate(campaign, results, crew, quiet)
+            results.write(complete=True)
+    out = results.summary()
+    out["elapsed_s"] = time.perf_counter() - begin
+    if plots:
+        from sdr.campaign_plot import plot
+
+        out["figures"] = [str(p) for p in plot(path)]
+    out["text"] = _text(out)
+    return out
+
+
+# -- what is kept -------------------------------------------------------------------------------------------------
+
+
+class Results:
+    """Counts of a campaign, its journal and its results file. Use as a context manager."""
+
+    def __init__(self, campaign: Campaign, path: Path) -> None:
+        self.campaign, self.path = campaign, path
+        self.journal_path = path.with_name(path.name + ".journal")
+        self.counts = [PointCount(campaign, i) for i in range(len(campaign.points))]
+        self.thresholds = np.zeros(0, THRESHOLD)
+        self.resumed = 0
+        self.complete = False
+        self._journal: Any = None
+        self._last, self._cost_s = time.monotonic(), 0.0
+
+    def __enter__(self) -> "Results":
+        self._read_results()
+        if self.complete:
+            return self
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self._journal = open(self.journal_path, "a+b")
+        self._lock()
+        try:
+            self._read_journal()
+        except ValueError:
+            self._journal.close()
+            raise
+        self.resumed = sum(c.done for c in self.counts)
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if self._journal is None:
+            return
+        if kind is not None:
+            with contextlib.suppress(OSError):
+                self.write()
+        self._journal.close()
+        if kind is None and self.complete:
+            self.journal_path.unlink(missing_ok=True)
+
+    def _lock(self) -> None:
+        try:
+            import fcntl
+        except ImportError:
+            return
+        try:
+            fcntl.flock(self._journal, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            self._journal.close()
+            raise ValueError(
+                f"another campaign is writing '{self.path}' now; wait for it or give another -o"
+            ) from None
+
+    def _read_results(self) -> None:
+        if not self.path.exists():
+            return
+        with store.read(self.path) as h5:
+            if "campaign/points" not in h5:
+                raise ValueError(
+                    f"'{self.path}' holds other results, not a campaign; give another -o or delete it"
+                )
+            self._check_origin(dict(h5["campaign/points"].attrs), self.path)
+            self.thresholds = h5["campaign/thresholds"][:] if "campaign/thresholds" in h5 else self.thresholds
+            if "campaign/trials" in h5:
+                self._add(h5["campaign/trials"][:])
+            self.complete = bool(h5.attrs["complete"])
+
+    def _check_origin(self, head: dict[str, Any], path: Path) -> None:
+        if head.get("fingerprint") != self.campaign.fingerprint:
+            raise ValueError(
+                f"'{path}' holds another campaign ('{head.get('campaign')}'): its settings differ; give another -o, "
+                "or delete it to start anew"
+            )
+        if head.get("version") != version():
+            raise ValueError(
+                f"'{path}' was begun by version {head.get('version')}, this is {version()}: trials of two versions are "
+                "not mixed; give another -o, or delete it to start anew"
+            )
+
+    def head(self) -> dict[str, str]:
+        """What identifies a results file."""
+        return {
+            "fingerprint": self.campaign.fingerprint, "version": version(), "campaign": self.campaign.spec.name,
+        }  # fmt: skip
+
+    def _read_journal(self) -> None:
+        """Take in every whole frame; cut off what a kill left torn."""
+        f = self._journal
+        f.seek(0, os.SEEK_END)
+        size = f.tell()
+        f.seek(0)
+        if size and f.read(len(_MAGIC)) != _MAGIC[:size]:
+            raise ValueError(f"'{self.journal_path}' is not a campaign journal; give another -o or delete it")
+        if size < len(_MAGIC):
+            f.truncate(0)
+            f.write(_MAGIC)
+            self._append(b"H", json.dumps(self.head()).encode())
+            return
+        good = f.tell()
+        for kind, payload in _frames(f, size):
+            self._take(kind, payload)
+            good = f.tell()
+        f.truncate(good)
+        if good == len(_MAGIC):
+            self._append(b"H", json.dumps(self.head()).encode())
+
+    def _take(self, kind: bytes, payload: bytes) -> None:
+        if kind == b"H":
+            self._check_origin(json.loads(payload), self.journal_path)
+            return
+        array = np.load(io.BytesIO(payload), allow_pickle=False)
+        if kind == b"T" and array.dtype == THRESHOLD:
+            new = array[~np.isin(array["group"], self.thresholds["group"])]
+            self.thresholds = np.concatenate([self.thresholds, new])
+        elif kind == b"R" and array.dtype == TRIAL:
+            self._add(array)
+        else:
+            raise ValueError(
+                f"'{self.journal_path}' has a record this version does not know; delete it to start anew"
+            )
+
+    def _append(self, kind: bytes, payload: bytes) -> None:
+        try:
+            self._journal.seek(0, os.SEEK_END)
+            self._journal.write(_FRAME.pack(kind, len(payload), zlib.crc32(payload)) + payload)
+            self._journal.flush()
+        except OSError as err:
+            raise OSError(
+                f"'{self.journal_path}' cannot be written: {err.strerror}; what it holds stays"
+            ) from None
+
+    def _append_array(self, kind: bytes, array: np.ndarray) -> None:
+        buffer = io.BytesIO()
+        np.save(buffer, array, allow_pickle=False)
+        self._append(kind, buffer.getvalue())
+
+    def keep_thresholds(self, rows: np.ndarray) -> None:
+        """Thresholds of one group, once and for all."""
+        self._append_array(b"T", rows)
+        self.thresholds = np.concatenate([self.thresholds, rows])
+
+    def keep(self, rows: np.ndarray) -> None:
+        """TRIAL rows of a chunk: journal first, then count."""
+        self._append_array(b"R", rows)
+        self._add(rows)
+        if time.monotonic() - self._last > max(5.0, 20.0 * self._cost_s):
+            self.write()
+
+    def _add(self, rows: np.ndarray) -> None:
+        m = len(self.campaign.spec.monitor)
+        for trial in rows.reshape(-1, m):
+            index = int(trial["point"][0])
+            if not 0 <= index < len(self.counts):
+                raise ValueError(
+                    f"'{self.path}' has trials of point {index}, which this campaign does not have"
+                )
+            self.counts[index].add(trial)
+
+    def write(self, complete: bool = False) -> None:
+        """Write the results file anew; it is replaced atomically."""
+        begin = time.monotonic()
+        out = store.Store(self.path, command="campaign", scenario=self.campaign.text, seed=None)
+        points = np.array(
+            [(c.index, c.done, (c.reason or "").encode()) for c in self.counts],
+            [("point", "i4"), ("trials", "i8"), ("stop_reason", "S16")],
+        )
+        axes = json.dumps(self.campaign.settings[:2000], default=str)
+        out.append("campaign/points", points, **self.head(), axes=axes)
+        out.append("campaign/thresholds", self.thresholds)
+        rows = [r for c in self.counts for r in c.rows]
+        out.append("campaign/trials", np.concatenate(rows) if rows else np.zeros(0, TRIAL))
+        rates = self.rows()
+        table = np.array(
+            [tuple(r[f] if r[f] is not None else np.nan for f in RATE.names) for r in _for_hdf5(rates)], RATE
+        )
+        out.append("campaign/rates", table)
+        out.checkpoint(complete=complete)
+        self.complete = complete
+        self._last = time.monotonic()
+        self._cost_s = self._last - begin
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Summary rows of the points that have trials."""
+        return summarise(self.campaign, self.counts, self.thresholds)
+
+    def summary(self) -> dict[str, Any]:
+        """The command's JSON object."""
+        spec = self.campaign.spec
+        trials = sum(c.done for c in self.counts)
+        return {
+            "name": spec.name,
+            "output": str(self.path),
+            "complete": self.complete,
+            "trials": trials,
+            "resumed_trials": self.resumed,
+            "epochs": trials * spec.trial.epochs,
+            "p_fa": spec.p_fa_test,
+            "points": self.rows(),
+        }
+
+
+def _for_hdf5(rows: list[dict[str, Any]]) -> Iterator[dict[str, Any]]:
+    for r in rows:
+        yield r | {"monitor": r["monitor"].encode(), "stop_reason": (r["stop_reason"] or "").encode()}
+
+
+def _frames(f: Any, size: int) -> Iterator[tuple[bytes, bytes]]:
+    """Whole, sound frames; stops at the first that is not."""
+    while True:
+        head = f.read(_FRAME.size)
+        if len(head) < _FRAME.size:
+            return
+        kind, length, crc = _FRAME.unpack(head)
+        if length > min(_MAX_FRAME, size - f.tell()):
+            return
+        payload = f.read(length)
+        if zlib.crc32(payload) != crc:
+            return
+        yield kind, payload
+
+
+# -- who computes -------------------------------------------------------------------------------------------------
+
+
+class _Local:
+    """Processes of this machine; a process that dies is replaced and its chunks are computed again."""
+
+    def __init__(self, workers: int, path: Path) -> None:
+        self.workers, self._path, self._deaths = workers, path, 0
+        self._start()
+
+    def _start(self) -> None:
+        import multiprocessing as mp
+
+        # One BLAS thread each: more would quarrel over the cores, and could change the last bit.
+        for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+            os.environ.setdefault(name, "1")
+        method = "forkserver" if "forkserver" in mp.get_all_start_methods() else "spawn"
+        context = mp.get_context(method)
+        if method == "forkserver":
+            context.set_forkserver_preload(["sdr.campaign"])
+        self._pool = futures.ProcessPoolExecutor(
+            self.workers, mp_context=context, initializer=_obey, initargs=(os.getpid(),)
+        )
+
+    def submit(self, function: Callable, *args: Any) -> futures.Future:
+        """A future of ``function(*args)``."""
+        try:
+            return self._pool.submit(function, *args)
+        except futures.BrokenExecutor:
+            self.revive()
+            return self._pool.submit(function, *args)
+
+    def revive(self) -> None:
+        """After a worker died: new processes, or an error if it happens again and again."""
+        self._deaths += 1
+        if self._deaths > _RETRIES:
+            raise OSError(
+                f"worker processes died {self._deaths} times (out of memory?); what was counted stays in "
+                f"'{self._path}', run the command again to go on"
+            )
+        self._pool.shutdown(wait=False, cancel_futures=True)
+        self._start()
+
+    def check(self) -> None:
+        """Nothing to lose here."""
+
+    def close(self, orderly: bool) -> None:
+        """End the processes."""
+        processes = list((getattr(self._pool, "_processes", None) or {}).values())
+        self._pool.shutdown(wait=orderly, cancel_futures=True)
+        if not orderly:
+            for p in processes:
+                p.terminate()
+
+
+def _obey(parent: int) -> None:
+    """Worker's start: interrupts are the parent's business, and without the parent there is no work."""
+    import signal
+    import threading
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+    def watch() -> None:
+        while True:
+            time.sleep(1.0)
+            try:
+                os.kill(parent, 0)
+            except OSError:
+                os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+class _Cluster:
+    """A Dask scheduler and its workers, which need this package installed."""
+
+    def __init__(self, address: str, path: Path) -> None:
+        try:
+            import distributed
+        except ImportError:
+            raise ImportError(
+                "--scheduler needs the extra 'cluster': pip install gnss-baseband[cluster]"
+            ) from None
+        import logging
+
+        logging.getLogger("distributed").setLevel(logging.CRITICAL)
+        self.address, self._path = address, path
+        try:
+            self._client = distributed.Client(address, timeout=CONNECT_S, set_as_default=False)
+        except (OSError, ValueError, TimeoutError) as err:
+            reason = " ".join(str(err).split())[:200]
+            raise OSError(f"scheduler '{address}' cannot be reached: {reason}") from None
+        self._executor = self._client.get_executor(pure=False, retries=_RETRIES)
+
+    @property
+    def workers(self) -> int:
+        """Threads of all workers now."""
+        return max(1, sum(self._client.nthreads().values()))
+
+    def submit(self, function: Callable, *args: Any) -> futures.Future:
+        """A future of ``function(*args)``."""
+        self.check()
+        return self._executor.submit(function, *args)
+
+    def revive(self) -> None:
+        """A chunk was lost with its workers."""
+        raise OSError(self._lost())
+
+    def check(self) -> None:
+        """Raise when the scheduler has gone."""
+        comm = self._client.scheduler_comm
+        if self._client.status != "running" or comm is None or comm.comm.closed():
+            raise OSError(self._lost())
+
+    def _lost(self) -> str:
+        return (
+            f"the cluster at '{self.address}' was lost; what was counted stays in '{self._path}', run the command "
+            "again to go on"
+        )
+
+    def close(self, orderly: bool) -> None:
+        """Leave the cluster as it was."""
+        with contextlib.suppress(Exception):
+            self._client.close(timeout=2)
+
+
+@contextlib.contextmanager
+def _crew(workers: int | None, scheduler: str | None, path: Path) -> Iterator[Any]:
+    if scheduler is not None and workers is not None:
+        raise ValueError("--workers counts local processes; with --scheduler the cluster has its own")
+    if workers is not None and not 1 <= workers <= 1024:
+        raise ValueError(f"--workers {workers}: give 1 to 1024")
+    own = (
+        workers or len(os.sched_getaffinity(0))
+        if hasattr(os, "sched_getaffinity")
+        else workers or os.cpu_count() or 1
+    )
+    crew: Any = _Cluster(scheduler, path) if scheduler is not None else _Local(own, path)
+    try:
+        yield crew
+    except BaseException:
+        crew.close(False)
+        raise
+    crew.close(True)
+
+
+def _each(
+    crew: Any, tasks: Iterator[tuple[Any, Callable, tuple]], ahead: Callable[[], int]
+) -> Iterator[tuple[Any, Any]]:
+    """Results (key, value) as they come, with at most ``ahead()`` tasks out at a time."""
+    out: dict[futures.Future, tuple[Any, Callable, tuple]] = {}
+    more = True
+    try:
+        while True:
+            while more and len(out) < ahead():
+                task = next(tasks, None)
+                more = task is not None
+                if task is not None:
+                    out[crew.submit(task[1], *task[2])] = task
+            if not out:
+                return
+            done, _ = futures.wait(out, timeout=1.0, return_when=futures.FIRST_COMPLETED)
+            crew.check()
+            for f in done:
+                yield from _result(crew, f, out)
+            more = True if done else more
+    finally:
+        for f in out:
+            f.cancel()
+
+
+def _result(crew: Any, f: futures.Future, out: dict) -> Iterator[tuple[Any, Any]]:
+    if f not in out:
+        return
+    task = out[f]
+    try:
+        value = f.result()
+    except (futures.BrokenExecutor, futures.CancelledError):
+        lost = list(out.values())
+        out.clear()
+        crew.revive()
+        for again in lost:
+            out[crew.submit(again[1], *again[2])] = again
+        return
+    except Exception as err:
+        if type(err).__name__ == "KilledWorker":
+            crew.revive()
+        raise
+    del out[f]
+    yield task[0], value
+
+
+# -- the two stages -----------------------------------------------------------------------------------------------
+
+
+def _thresholds(campaign: Campaign, results: Results, crew: Any, quiet: bool) -> None:
+    """Thresholds of every group that has none yet."""
+    missing = [g for g in range(len(campaign.quiet)) if g not in results.thresholds["group"]]
+    if all(m.threshold is not None for m in campaign.spec.monitor):
+        for g in missing:
+            results.keep_thresholds(fit_thresholds(campaign, g, []))
+        return
+    n = campaign.spec.threshold.trials
+    size = max(1, n // (4 * crew.workers))
+    values: dict[int, list] = {g: [None] * n for g in missing}
+    tasks = (
+        ((g, first), quiet_statistics, (campaign.text, g, first, min(size, n - first)))
+        for g in missing
+        for first in range(0, n, size)
+    )
+    with _progress(f"{campaign.spec.name}: thresholds", n * len(missing), quiet) as advance:
+        done = 0
+        for (g, first), part in _each(crew, tasks, lambda: 2 * crew.workers):
+            values[g][first : first + len(part)] = part
+            done += len(part)
+            if all(v is not None for v in values[g]):
+                results.keep_thresholds(fit_thresholds(campaign, g, values.pop(g)))
+            advance(done)
+
+
+class _Planner:
+    """Chunks of trials, point after point; sized to last about CHUNK_S."""
+
+    def __init__(self, campaign: Campaign, results: Results, crew: Any) -> None:
+        self.campaign, self.counts, self.crew = campaign, results.counts, crew
+        self.limits = results.thresholds
+        self.next = [0] * len(self.counts)
+        self.trial_s: float | None = None
+
+    def __iter__(self) -> "_Planner":
+        return self
+
+    def __next__(self) -> tuple[Any, Callable, tuple]:
+        most = self.campaign.spec.stop.max_trials
+        for c in self.counts:
+            i = c.index
+            while c.reason is None and self.next[i] < most and c.has(self.next[i]):
+                self.next[i] += 1
+            if c.reason is not None or self.next[i] >= most:
+                continue
+            first = self.next[i]
+            last = first + 1
+            stop = min(most, first + self._size(most - first))
+            while last < stop and not c.has(last):
+                last += 1
+            self.next[i] = last
+            return (
+                (i, last - first),
+                _timed_trials,
+                (self.campaign.text, i, first, last - first, self._limits(i)),
+            )
+        raise StopIteration
+
+    def _size(self, left: int) -> int:
+        if self.trial_s is None:
+            return 1
+        return max(1, min(int(CHUNK_S / self.trial_s), -(-left // (2 * self.crew.workers))))
+
+    def _limits(self, point: int) -> tuple[float, ...]:
+        rows = self.limits[self.limits["group"] == self.campaign.group[point]]
+        return tuple(float(x) for x in rows["threshold"][np.argsort(rows["monitor"])])
+
+
+def _timed_trials(
+    text: str, point: int, first: int, count: int, limits: tuple[float, ...]
+) -> tuple[np.ndarray, float]:
+    from sdr.campaign import _campaign, _trained
+
+    _trained(text, _campaign(text).group[point])
+    begin = time.perf_counter()
+    rows = evaluate_trials(text, point, first, count, limits)
+    return rows, time.perf_counter() - begin
+
+
+def _evaluate(campaign: Campaign, results: Results, crew: Any, quiet: bool) -> None:
+    planner = _Planner(campaign, results, crew)
+    most = campaign.spec.stop.max_trials
+    total = most * len(results.counts)
+    with _progress(campaign.spec.name, total, quiet) as advance:
+        for (_, size), (rows, elapsed_s) in _each(crew, planner, lambda: 2 * crew.workers):
+            planner.trial_s = max(elapsed_s / size, 1e-6)
+            results.keep(rows)
+            finished = sum(c.reason is not None for c in results.counts)
+            done = sum(most if c.reason is not None else c.done for c in results.counts)
+            advance(done, f"{finished} of {len(results.counts)} points")
+
+
+def _text(out: dict[str, Any]) -> str:
+    rows = [
+        f"{out['name']}: {out['trials']} trials in {out['elapsed_s']:.1f} s, P_FA {out['p_fa']:.3g} per test"
+    ]
+    if out["resumed_trials"]:
+        rows[0] += f" ({out['resumed_trials']} trials were there already)"
+    for r in out["points"]:
+        axes = ", ".join(f"{k} = {v}" for k, v in r["axes"].items()) or "the only point"
+        rate = "none" if r["rate"] is None else f"{r['rate']:.3g}"
+        rows.append(
+            f"  {r['point']:4d}  {r['monitor']:16} {'P_FA' if r['definition'] == 'false_alarm' else 'P_MD'} {rate:>9} "
+            f"[{r['ci_low']:.2g}, {r['ci_high']:.2g}]  {r['k']}/{r['n']}, n_eff {r['n_effective']:.0f}, "
+            f"{r['trials']} trials ({r['stop_reason']})  {axes}"
+        )
+    rows.append(f"results in {out['output']}")
+    return "\n".join(rows + [f"  {p}" for p in out.get("figures", [])])
+
+
+def read_rates(path: Path | str) -> h5py.File:
+    """Open a campaign's results for reading."""
+    h5 = store.read(path)
+    if "campaign/points" not in h5:
+        h5.close()
+        raise ValueError(f"'{path}' holds no campaign; give a results file written by gnssbb campaign")
+    return h5
