@@ -12,6 +12,7 @@ from monitors.detection import clopper_pearson
 
 __all__ = [
     "COLUMNS",
+    "EXPERIMENTS",
     "VERDICTS",
     "clopper_pearson",
     "format_table",
@@ -22,6 +23,12 @@ __all__ = [
     "write_table",
 ]
 
+EXPERIMENTS = {
+    "abdelhafez-als": "sdr.reproduce.als",
+    "abdelhafez-bias": "sdr.reproduce.bias",
+    "vanek1999": "sdr.reproduce.vanek",
+}
+"""Command-line name -> module with ``run``; imported only when asked for."""
 VERDICTS = ("reproduced", "not reproduced", "not stated")
 COLUMNS = ("item", "published", "ours", "ci_low", "ci_high", "verdict", "note")
 
