@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numba import njit
 
-from signals.kernels import _FAST, _splitmix64, noise_block
+from signals.kernels import _FAST, _cis, _splitmix64, noise_block
 from signals.modulation import BLOCK
 
 __all__ = ["MAX_PHASES", "N_TAPS", "add_code", "add_narrowband", "add_pulses", "add_tone", "add_wideband"]
@@ -19,6 +19,10 @@ N_TAPS = 16
 """Lattice points under the interpolation filter of narrow-band noise."""
 MAX_PHASES = 16
 """Phases of that filter; finer steps are linear between them."""
+SUB = 256
+"""Samples under one turn of a carrier's base table."""
+GROUP = 16
+"""Blocks that share a base table."""
 _F = np.float32
 _I = np.int32
 _U = np.uint32
@@ -40,8 +44,8 @@ def tone(out_i, out_q, k0, k1, p, f, h):
     Polynomials of sine and cosine of half the angle: those of ``signals.kernels.noise_block``.
     """
     p32, f32, h32 = _turns(p), _turns(f), _turns(h)
-    for k in range(k0, k1):
-        j = _U(k - k0)
+    for m in range(k1 - k0):
+        j, k = _U(m), _Q(m) + _Q(k0)
         phase = _U(p32 + j * _U(f32 + _U(j * h32)))
         a = _F(_I(phase)) * _F(2.0**-32)
         a2 = a * a
@@ -66,17 +70,61 @@ def _carrier(n, cell0, n_cell, carrier):
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST)
+def _add_row(out, at, buf, k0, n, a0, slope):
+    """out[at + m] += (a0 + slope m) buf[k0 + m], m < n."""
+    o, b = _Q(at), _Q(k0)
+    if slope == 0:
+        for m in range(n):
+            k = _Q(m)
+            out[o + k] += a0 * buf[b + k]
+        return
+    for m in range(n):
+        k = _Q(m)
+        out[o + k] += (a0 + slope * _F(_I(m))) * buf[b + k]
+
+
+@njit(cache=True, nogil=True)
 def _add(iq, n0, lo, hi, block, buf_i, buf_q, level, b):
     """iq += level buf over the part of the block inside [lo, hi); the level is a line from edge to edge."""
     first = block * BLOCK
     k0, k1 = max(lo - first, 0), min(hi - first, BLOCK)
     a0, a1 = level[min(b, len(level) - 1)], level[min(b + 1, len(level) - 1)]
     slope = (a1 - a0) * _F(1.0 / BLOCK)
-    at = first - n0
-    for k in range(k0, k1):
-        a = a0 + slope * _F(k)
-        iq[0, at + k] += a * buf_i[k]
-        iq[1, at + k] += a * buf_q[k]
+    a0 += slope * _F(k0)
+    _add_row(iq[0], first + k0 - n0, buf_i, k0, k1 - k0, a0, slope)
+    _add_row(iq[1], first + k0 - n0, buf_q, k0, k1 - k0, a0, slope)
+
+
+@njit(cache=True, nogil=True, fastmath=_FAST)
+def _turn_base(out_i, out_q, base_i, base_q, sub, re, im):
+    o = _Q(sub * SUB)
+    for m in range(SUB):
+        k = _Q(m)
+        x, y = base_i[k], base_q[k]
+        out_i[o + k] = re * x - im * y
+        out_q[o + k] = re * y + im * x
+
+
+@njit(cache=True, nogil=True)
+def _steady(out_i, out_q, block, cell0, n_cell, carrier, base_i, base_q, based):
+    """The carrier over a block; ``based``: the group of blocks for which the base was made, which is returned.
+
+    A base table exp(2 pi i f k) turned every SUB samples, f that of the middle of a group of GROUP blocks. Where the
+    frequency moves too fast for that, the quadratic `tone`.
+    """
+    group = block // GROUP
+    p, f, h = _carrier((group * GROUP + GROUP // 2) * BLOCK, cell0, n_cell, carrier)
+    if abs(h) * (GROUP * BLOCK * SUB) > 4e-7:
+        p, f, h = _carrier(block * BLOCK, cell0, n_cell, carrier)
+        tone(out_i, out_q, 0, BLOCK, p, f, h)
+        return np.int64(-1)
+    if based != group:
+        tone(base_i, base_q, 0, SUB, -f * (SUB // 2), f, 0.0)
+    for sub in range(BLOCK // SUB):
+        p, f, h = _carrier(block * BLOCK + sub * SUB + SUB // 2, cell0, n_cell, carrier)
+        re, im = _cis(p)
+        _turn_base(out_i, out_q, base_i, base_q, sub, _F(re), _F(im))
+    return group
 
 
 @njit(cache=True, nogil=True)
@@ -117,13 +165,14 @@ def add_tone(
         Phase in cycles: cubics (cells, 4) in x over cells of ``n_cell`` samples, the first one ``cell0``.
     """
     buf_i, buf_q = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
-    b0 = lo // BLOCK
+    base_i, base_q = np.empty(SUB, np.float32), np.empty(SUB, np.float32)
+    b0, based = lo // BLOCK, np.int64(-1)
     for block in range(b0, (hi - 1) // BLOCK + 1):
-        p, f, h = _carrier(block * BLOCK, cell0, n_cell, carrier)
         if sweep_hz > 0.0:
+            p, f, h = _carrier(block * BLOCK, cell0, n_cell, carrier)
             _sweep(buf_i, buf_q, block * BLOCK, fs_hz, p, f, h, sweep_s, sweep_hz, triangular)
         else:
-            tone(buf_i, buf_q, 0, BLOCK, p, f, h)
+            based = _steady(buf_i, buf_q, block, cell0, n_cell, carrier, base_i, base_q, based)
         _add(iq, n0, lo, hi, block, buf_i, buf_q, level, block - b0)
 
 
@@ -188,44 +237,55 @@ def add_wideband(iq, n0, lo, hi, level, seed):
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST)
-def _interpolate(out_i, out_q, n, spread_i, spread_q, taps, step):
-    """out[k] = sum over t of taps[t, k mod width] spread[k + t step], k < n."""
-    width = taps.shape[1]
+def _interpolate(out, n, spread, taps, width, step):
+    """out[k] = sum over t of taps[t width + k mod width] spread[k + t step], k < n; I or Q alone.
+
+    Few arrays at a time: the vectoriser gives up where too many could overlap.
+    """
     for k0 in range(0, n, width):
-        out_i[k0 : k0 + width] = 0
-        out_q[k0 : k0 + width] = 0
-        for t in range(0, N_TAPS, 4):
-            at = k0 + t * step
-            for k in range(width):
-                w0, w1, w2, w3 = taps[t, k], taps[t + 1, k], taps[t + 2, k], taps[t + 3, k]
-                a, b, c, d = at + k, at + step + k, at + 2 * step + k, at + 3 * step + k
-                out_i[k0 + k] += (
-                    w0 * spread_i[a] + w1 * spread_i[b] + w2 * spread_i[c] + w3 * spread_i[d]
-                )
-                out_q[k0 + k] += (
-                    w0 * spread_q[a] + w1 * spread_q[b] + w2 * spread_q[c] + w3 * spread_q[d]
+        for t in range(0, N_TAPS, 8):
+            h, g = _Q(t * width), _Q(k0 + t * step)
+            w, d, o = _Q(width), _Q(step), _Q(k0)
+            keep = _F(0) if t == 0 else _F(1)
+            for m in range(width):
+                k = _Q(m)
+                out[o + k] = (
+                    keep * out[o + k]
+                    + taps[h + k] * spread[g + k]
+                    + taps[h + w + k] * spread[g + d + k]
+                    + taps[h + _Q(2) * w + k] * spread[g + _Q(2) * d + k]
+                    + taps[h + _Q(3) * w + k] * spread[g + _Q(3) * d + k]
+                    + taps[h + _Q(4) * w + k] * spread[g + _Q(4) * d + k]
+                    + taps[h + _Q(5) * w + k] * spread[g + _Q(5) * d + k]
+                    + taps[h + _Q(6) * w + k] * spread[g + _Q(6) * d + k]
+                    + taps[h + _Q(7) * w + k] * spread[g + _Q(7) * d + k]
                 )
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST)
-def _linear(out_i, out_q, coarse_i, coarse_q, shift, step):
-    """out[k] on the line between coarse points; the first output is ``shift`` samples after coarse[0]."""
+def _linear(out, coarse, at, shift, step):
+    """out[k] on the line between coarse points; the first output is ``shift`` samples after coarse[at]."""
+    if step == 1:
+        for m in range(BLOCK):
+            k = _Q(m)
+            out[k] = coarse[_Q(at) + k]
+        return
     inverse = _F(1.0 / step)
-    k, j, begin = 0, 0, shift
+    k, j, begin = 0, at, shift
     while k < BLOCK:
-        end = min(k + step - begin, BLOCK)
-        i0, q0 = coarse_i[j], coarse_q[j]
-        di, dq = (coarse_i[j + 1] - i0) * inverse, (coarse_q[j + 1] - q0) * inverse
-        for m in range(k, end):
-            x = _F(m - k + begin)
-            out_i[m] = i0 + x * di
-            out_q[m] = q0 + x * dq
-        k, j, begin = end, j + 1, 0
+        n = min(step - begin, BLOCK - k)
+        x0 = coarse[j]
+        slope = (coarse[j + 1] - x0) * inverse
+        x0 += slope * _F(begin)
+        for m in range(n):
+            out[_Q(k) + _Q(m)] = x0 + slope * _F(_I(m))
+        k, j, begin = k + n, j + 1, 0
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST)
 def _rotate(buf_i, buf_q, c, s):
-    for k in range(BLOCK):
+    for m in range(BLOCK):
+        k = _Q(m)
         x, y = buf_i[k], buf_q[k]
         buf_i[k] = x * c[k] - y * s[k]
         buf_q[k] = x * s[k] + y * c[k]
@@ -240,14 +300,15 @@ def add_narrowband(
     A polyphase filter (``taps`` float32 (N_TAPS, width), width a multiple of ``phases``) gives the points every
     ``step`` samples, lines join them. ``still``: the carrier does not move, nothing is shifted.
     """
-    width = taps.shape[1]
+    width, flat = taps.shape[1], taps.ravel()
     n_spread = BLOCK + 2 * width + N_TAPS * phases
     lattice_i, lattice_q = np.empty(3 * BLOCK, np.float32), np.empty(3 * BLOCK, np.float32)
     hash1, hash2 = np.empty(BLOCK, np.uint32), np.empty(BLOCK, np.int32)
     spread_i, spread_q = np.empty(n_spread, np.float32), np.empty(n_spread, np.float32)
-    coarse_i, coarse_q = np.empty(BLOCK + 2 * width, np.float32), np.empty(BLOCK + 2 * width, np.float32)
+    coarse_i, coarse_q = np.zeros(BLOCK + 2 * width, np.float32), np.zeros(BLOCK + 2 * width, np.float32)
     buf_i, buf_q = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
     c, s = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
+    base_i, base_q, based = np.empty(SUB, np.float32), np.empty(SUB, np.float32), np.int64(-1)
     held, count, b0 = np.int64(-9), 0, lo // BLOCK
     for block in range(b0, (hi - 1) // BLOCK + 1):
         first = block * BLOCK
@@ -264,7 +325,10 @@ def add_narrowband(
             count = 0
         held = wanted
         while held + count <= (m0 + (n_coarse + width) // phases + N_TAPS) // BLOCK:
-            x, y = lattice_i[count * BLOCK : (count + 1) * BLOCK], lattice_q[count * BLOCK : (count + 1) * BLOCK]
+            x, y = (
+                lattice_i[count * BLOCK : (count + 1) * BLOCK],
+                lattice_q[count * BLOCK : (count + 1) * BLOCK],
+            )
             noise_block(x, y, hash1, hash2, seed, _Q(held + count), _F(math.sqrt(0.5)))
             count += 1
         at = m0 - wanted * BLOCK
@@ -277,20 +341,20 @@ def add_narrowband(
                 for r in range(m * phases, min((m + 1) * phases, n_spread)):
                     spread_i[r] = lattice_i[at + m]
                     spread_q[r] = lattice_q[at + m]
-        _interpolate(coarse_i, coarse_q, n_coarse, spread_i, spread_q, taps, phases)
-        _linear(
-            buf_i, buf_q, coarse_i[j0 - m0 * phases :], coarse_q[j0 - m0 * phases :], first - j0 * step, step
-        )
+        _interpolate(coarse_i, n_coarse, spread_i, flat, width, phases)
+        _interpolate(coarse_q, n_coarse, spread_q, flat, width, phases)
+        _linear(buf_i, coarse_i, j0 - m0 * phases, first - j0 * step, step)
+        _linear(buf_q, coarse_q, j0 - m0 * phases, first - j0 * step, step)
         if not still:
-            p, f, h = _carrier(first, cell0, n_cell, carrier)
-            tone(c, s, 0, BLOCK, p, f, h)
+            based = _steady(c, s, block, cell0, n_cell, carrier, base_i, base_q, based)
             _rotate(buf_i, buf_q, c, s)
         _add(iq, n0, lo, hi, block, buf_i, buf_q, level, block - b0)
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST)
 def _times_code(buf_i, buf_q, row, k0, k1, sign):
-    for k in range(k0, k1):
+    for m in range(k1 - k0):
+        k = _Q(m) + _Q(k0)
         chip = sign * _F(row[k])
         buf_i[k] *= chip
         buf_q[k] *= chip
@@ -302,12 +366,12 @@ def add_code(
 ):  # fmt: skip
     """A carrier under a long code, ``table`` int8 (P, n): rows 1/P sample apart; a random sign every period."""
     buf_i, buf_q = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
+    base_i, base_q = np.empty(SUB, np.float32), np.empty(SUB, np.float32)
     n_rows = table.shape[0]
-    b0 = lo // BLOCK
+    b0, based = lo // BLOCK, np.int64(-1)
     for block in range(b0, (hi - 1) // BLOCK + 1):
         first = block * BLOCK
-        p, f, h = _carrier(first, cell0, n_cell, carrier)
-        tone(buf_i, buf_q, 0, BLOCK, p, f, h)
+        based = _steady(buf_i, buf_q, block, cell0, n_cell, carrier, base_i, base_q, based)
         turn = np.floor(first / samples_per_period)
         q = np.int64((first - turn * samples_per_period) * n_rows + 0.5)
         roll = min(max(np.int64(np.ceil(samples_per_period - q / n_rows)), 0), BLOCK)

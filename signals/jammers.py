@@ -79,7 +79,7 @@ class CodeLine(BaseModel):
         if k >= len(freq_hz) or level_db[k] < -100.0:
             raise ValueError(
                 f"line {self.line} of {self.signal} PRN {self.prn} does not exist: the spectrum of its code ({waveform})"
-                f" has no power there; use an index up to {len(freq_hz) - 1} that `gnssbb lines` lists, or \"worst\""
+                f' has no power there; use an index up to {len(freq_hz) - 1} that `gnssbb lines` lists, or "worst"'
             )
         return math.copysign(float(freq_hz[k]), self.line)
 
@@ -116,7 +116,9 @@ class _Jammer(BaseModel):
         if any(b <= a for a, b in zip(times, times[1:])) or any(abs(d) > 200 for _, d in self.profile):
             raise ValueError("profile must be pairs (t_s, db) with growing times and at most 200 dB")
         if self.line is not None and (self.freq_hz or self.rate_hz_s):
-            raise ValueError("freq_hz and rate_hz_s belong to a jammer without line: use line.offset_hz and .rate_hz_s")
+            raise ValueError(
+                "freq_hz and rate_hz_s belong to a jammer without line: use line.offset_hz and .rate_hz_s"
+            )
         return self
 
     @property
@@ -234,7 +236,9 @@ class Pulsed(_Jammer):
     @model_validator(mode="after")
     def _fits(self):
         if (self.duty is None) != (self.shape == "dme"):
-            raise ValueError("duty belongs to rectangular pulses, which need it; dme pulses have their own width")
+            raise ValueError(
+                "duty belongs to rectangular pulses, which need it; dme pulses have their own width"
+            )
         span_s = self.pair_spacing_s + 10 * _PULSE_S
         if self.shape == "dme" and span_s > 1.0 / self.rate_hz:
             raise ValueError(
@@ -252,9 +256,17 @@ class Pulsed(_Jammer):
         """See `_Jammer.wave`."""
         slot_s = 1.0 / self.rate_hz
         if self.shape == "rectangular":
-            return kernels.add_pulses, (fs_hz, seed, slot_s, self.duty * slot_s, 0.0, False, self.random), self.duty
+            return (
+                kernels.add_pulses,
+                (fs_hz, seed, slot_s, self.duty * slot_s, 0.0, False, self.random),
+                self.duty,
+            )
         # Mean of (g(t) + g(t - D))^2: two pulses of energy sqrt(pi) w, and the overlap.
-        pulses = 1.0 if self.pair_spacing_s == 0 else 2.0 + 2.0 * math.exp(-((self.pair_spacing_s / _PULSE_S) ** 2) / 4)
+        pulses = (
+            1.0
+            if self.pair_spacing_s == 0
+            else 2.0 + 2.0 * math.exp(-((self.pair_spacing_s / _PULSE_S) ** 2) / 4)
+        )
         duty = pulses * math.sqrt(math.pi) * _PULSE_S * self.rate_hz
         args = (fs_hz, seed, slot_s, _PULSE_S, self.pair_spacing_s, True, self.random)
         return kernels.add_pulses, args, duty
@@ -374,7 +386,9 @@ class Interferer(_Jammer):
         read, n_file = context["open_recording"](self.path, fs_hz)
         power = _mean_power(read, min(n_file, max(int(self.power_window_s * fs_hz), 1)))
         if power == 0.0:
-            raise ValueError(f"interferer '{self.path}' begins with {self.power_window_s:g} s of zeros: it has no power")
+            raise ValueError(
+                f"interferer '{self.path}' begins with {self.power_window_s:g} s of zeros: it has no power"
+            )
         return _file_adder(read, n_file, self.repeat, power, int(self.start_s * fs_hz)), (), 1.0
 
 
@@ -437,10 +451,17 @@ class JammerRun:
             return
         n_cell = self.fs_hz / CELLS_PER_S
         b0, b1 = lo // BLOCK, -(-hi // BLOCK)
-        cell0, cell1 = int(b0 * BLOCK / n_cell), int(b1 * BLOCK / n_cell)
+        # Base tables belong to whole groups of blocks, whatever part of them is asked for.
+        group = kernels.GROUP * BLOCK
+        cell0, cell1 = (
+            int(b0 * BLOCK // group * group / n_cell),
+            int((b1 * BLOCK // group + 1) * group / n_cell),
+        )
         first, last = cell0 // CELLS_PER_S, cell1 // CELLS_PER_S
         carrier = (
-            self._cells(first) if first == last else np.concatenate([self._cells(k) for k in range(first, last + 1)])
+            self._cells(first)
+            if first == last
+            else np.concatenate([self._cells(k) for k in range(first, last + 1)])
         )
         self.kernel(
             iq, n0, lo, hi, self._level(b0, b1), first * CELLS_PER_S, n_cell, carrier, *self.args
@@ -533,7 +554,9 @@ class JammerRun:
         out["freq_hz"] = self.freq_hz(out["t_s"])
         profile_db = self.profile_db(out["t_s"])
         out["jn0_dbhz"] = np.where(out["on"], self.jn0_dbhz + profile_db, -np.inf)
-        out["js_db"] = np.where(out["on"], self.spec.js_db + profile_db, -np.inf) if self.spec.against else np.nan
+        out["js_db"] = (
+            np.where(out["on"], self.spec.js_db + profile_db, -np.inf) if self.spec.against else np.nan
+        )
         return out
 
     def _width_hz(self) -> float:

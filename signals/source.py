@@ -96,7 +96,9 @@ class SyntheticSource:
         self._seed = seed.generate_state(1, np.uint64)[0]
         self._sigma = np.float32(1.0 if noise else 0.0)
         self._codes, self._components = _code_buffer(sky.satellites, self.fs_hz, code_path)
-        self.echoes = {row: run for row, s in enumerate(sky.satellites) if (run := (echoes or {}).get(s.name))}
+        self.echoes = {
+            row: run for row, s in enumerate(sky.satellites) if (run := (echoes or {}).get(s.name))
+        }
         rows = [np.full(run.n_echo, row) for row, run in self.echoes.items()]
         self._rows = np.concatenate([np.arange(len(sky.satellites)), *rows]).astype(np.int64)
         self._segment = (-1, np.zeros(0, np.int8), self._components)
@@ -333,7 +335,11 @@ def _messages(sky: Sky, satellite: Satellite, start_s: int):
         tow = sky.tow_s + start_s
         week, tow = sky.week + tow // 604_800, tow % 604_800
         messages = [
-            (encode(satellite.ephemeris, sky.iono_utc[()], almanac, week, tow, span_s * per_s), first, periods)
+            (
+                encode(satellite.ephemeris, sky.iono_utc[()], almanac, week, tow, span_s * per_s),
+                first,
+                periods,
+            )
         ]
     if system == "E":
         messages.append((secondary_code().astype(np.int8), 0, 1))
