@@ -374,6 +374,11 @@ class RecordingSource:
         self._position = n0 + n
         return n0, out
 
+    def read_at(self, n0: int, n: int) -> tuple[int, np.ndarray]:
+        """The same from sample ``n0`` on."""
+        self._position = n0
+        return self.read(n)
+
     def close(self) -> None:
         """Close the file."""
         self._file.close()
@@ -654,7 +659,7 @@ def create_recording(base: Path | str, source: Any, scenario: Any = None) -> Rec
         a
         for j in getattr(source, "jammers", ())
         if hasattr(j, "annotations")
-        for a in j.annotations(source.fs_hz)
+        for a in j.annotations(source.fs_hz, source.n_samples)
     ]
     extra = {"gnss:week": sky.week, "gnss:tow_s": float(sky.tow_s), "gnss:bits": front_end.bits}
     if scenario is not None:

@@ -242,6 +242,8 @@ class _Truth:
         if len(ready) >= 10 or (last and len(ready)):
             self._store.append("truth/satellites", self._source.truth(ready))
             self._store.append("truth/receiver", self._source.pvt_truth(ready))
+            self._store.append("truth/jammers", self._source.jammer_truth(ready))
+            self._store.append("truth/echoes", self._source.echo_truth(ready))
             self._index = self._index[len(ready) :]
 
 
@@ -286,7 +288,9 @@ def _fix(receiver: Receiver, source: Any, tally: _Tally) -> dict[str, Any] | Non
 
 def _why_no_fix(receiver: Receiver, duration_s: float, satellites: list[dict[str, Any]]) -> str:
     if not satellites:
-        searched = receiver.searched_text() or "nothing: the recording is shorter than one search, or all zeros"
+        searched = (
+            receiver.searched_text() or "nothing: the recording is shorter than one search, or all zeros"
+        )
         return f"no satellite was found; searched {searched}"
     locked = [s for s in satellites if s["locked_s"] > 0]
     with_ephemeris = [s for s in satellites if s["ephemeris"]]

@@ -4,8 +4,9 @@ A scenario is the union of the Specs that the packages own; there is no second s
 out-of-range key is refused with the key, the value and what is allowed.
 """
 
+import threading
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -16,7 +17,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from nav.navigator import NavigationSpec
 from signals.clock import ClockSpec
 from signals.frontend import FrontEndSpec
-from signals.sky import SkySpec
+from signals.jammers import JammerRun, JammerSpec
+from signals.multipath import EchoRun, MultipathSpec
+from signals.sky import Sky, SkySpec
 from signals.source import SyntheticSource
 from signals.trajectory import MotionSpec, Static
 from tracking.acquisition import AcquisitionSpec
@@ -35,11 +38,11 @@ class ReceiverSpec(BaseModel):
     acquisition: AcquisitionSpec = AcquisitionSpec()
     tracking: TrackingSpec = TrackingSpec()
     navigation: NavigationSpec = NavigationSpec()
-    slab_ms: Annotated[int, Field(ge=20, le=200, multiple_of=20)] = 100
-    """Length of the slab of samples that passes through the loop at once."""
+    slab_ms: Annotated[int, Field(ge=20, le=1000, multiple_of=20)] = 200
+    """Longest slab of samples that passes through the loop at once; the results hardly depend on it."""
     search_every_s: Annotated[float, Field(gt=0)] = 5.0
     """All satellites are searched again this often while too few are tracked."""
-    search_one_every_s: Annotated[float, Field(gt=0)] = 2.0
+    search_one_every_s: Annotated[float, Field(gt=0)] = 10.0
     """Later, one satellite in turn is searched this often."""
 
 
@@ -57,6 +60,8 @@ class Scenario(BaseModel):
     motion: Annotated[MotionSpec, Field(discriminator="kind")] = Static()
     clock: ClockSpec = ClockSpec()
     front_end: FrontEndSpec = FrontEndSpec()
+    jammer: tuple[JammerSpec, ...] = ()
+    multipath: MultipathSpec | None = None
     receiver: ReceiverSpec = ReceiverSpec()
 
 
@@ -66,14 +71,71 @@ NOISE, CLOCK, SKY, JAMMERS, MULTIPATH, SENSORS = range(6)
 
 def source(spec: Scenario, threads: int = 1) -> SyntheticSource:
     """The samples of a scenario."""
-    motion = spec.motion.start(spec.duration_s)
+    motion = spec.motion.start()
     clock = spec.clock.start(_child(spec, CLOCK), spec.duration_s, motion)
     sky = spec.sky.start(motion, clock, spec.duration_s, _child(spec, SKY))
-    return SyntheticSource(sky, spec.front_end, spec.duration_s, _child(spec, NOISE), threads=threads)
+    return SyntheticSource(
+        sky, spec.front_end, spec.duration_s, _child(spec, NOISE),
+        jammers=jammers(spec, spec.front_end.fs_hz, spec.front_end.if_hz, spec.front_end.complex, sky),
+        echoes=echoes(spec, [s.name for s in sky.satellites]), threads=threads,
+    )  # fmt: skip
 
 
-def _child(spec: Scenario, part: int) -> np.random.SeedSequence:
-    return np.random.SeedSequence(spec.seed, spawn_key=(part,))
+def jammers(spec: Scenario, fs_hz: float, if_hz: float, is_complex: bool, sky: Sky | None) -> list[JammerRun]:
+    """The scenario's jammers, each with its own seed, in samples of this rate."""
+    runs = []
+    for k, one in enumerate(spec.jammer):
+        try:
+            seed = _child(spec, JAMMERS, k)
+            runs.append(
+                one.start(fs_hz, if_hz, spec.duration_s, seed, sky, is_complex, open_recording=_interferer)
+            )
+        except ValueError as err:
+            raise ValueError(f"jammer {k + 1} ({one.kind}): {err}") from None
+    return runs
+
+
+def echoes(spec: Scenario, names: Sequence[str]) -> dict[str, EchoRun]:
+    """The echoes of the satellites, by name; each satellite has its own seed."""
+    if spec.multipath is None:
+        return {}
+    wanted = names if spec.multipath.satellites is None else spec.multipath.satellites
+    missing = [n for n in wanted if n not in names]
+    if missing:
+        raise ValueError(
+            f"multipath.satellites: {missing[0]} is not in the sky; there are {', '.join(names)}"
+        )
+    return {n: spec.multipath.start(_child(spec, MULTIPATH, ord(n[0]), int(n[1:]))) for n in wanted}
+
+
+def _interferer(path: str, fs_hz: float) -> tuple[Callable[[int, int], np.ndarray], int]:
+    """Random access to a recording as interferer: reader(n0, n) -> float32 (2, n) at zero frequency, and its length."""
+    from sdr import iffile
+
+    file = iffile.open_recording(path, iffile.declaration(path))
+    if abs(file.fs_hz - fs_hz) > 1e-9 * fs_hz:
+        raise ValueError(
+            f"'{path}' has a rate of {file.fs_hz:g} Hz and the scenario one of {fs_hz:g}: an interferer must have the"
+            " same rate; resample it"
+        )
+    if not file.complex:
+        raise ValueError(f"'{path}' holds real samples: an interferer must be complex")
+    lock = threading.Lock()
+
+    def read(n0: int, n: int) -> np.ndarray:
+        with lock:
+            x = file.read_at(n0, n)[1].astype(np.float32)
+        if not file.if_hz:
+            return x
+        turns = np.mod(np.arange(n0, n0 + n) * (file.if_hz / fs_hz), 1.0)
+        z = (x[0] + 1j * x[1]) * np.exp(-2j * np.pi * turns)
+        return np.stack([z.real, z.imag]).astype(np.float32)
+
+    return read, file.n_samples
+
+
+def _child(spec: Scenario, *part: int) -> np.random.SeedSequence:
+    return np.random.SeedSequence(spec.seed, spawn_key=part)
 
 
 def built_in() -> list[str]:

@@ -9,6 +9,7 @@ Frequency. ``freq_hz`` from the carrier, moving by ``rate_hz_s`` from the start 
 Every wave depends on the absolute sample index alone, so that any chunking gives the same bits.
 """
 
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -113,7 +114,7 @@ class _Jammer(BaseModel):
         if self.stop_s is not None and self.stop_s <= self.start_s:
             raise ValueError(f"stop_s = {self.stop_s:g} must be later than start_s = {self.start_s:g}")
         times = [t for t, _ in self.profile]
-        if any(b <= a for a, b in zip(times, times[1:])) or any(abs(d) > 200 for _, d in self.profile):
+        if any(b <= a for a, b in itertools.pairwise(times)) or any(abs(d) > 200 for _, d in self.profile):
             raise ValueError("profile must be pairs (t_s, db) with growing times and at most 200 dB")
         if self.line is not None and (self.freq_hz or self.rate_hz_s):
             raise ValueError(

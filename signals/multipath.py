@@ -66,6 +66,9 @@ def echo_series(t0_s, step_s, amplitude, doppler_hz, tone_hz, tone_cycles, out):
             out[k, i] = a * total[i]
 
 
+_SatId = Annotated[str, Field(pattern=r"^[GE]\d\d$")]
+
+
 class _Spec(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -87,6 +90,8 @@ class Echoes(_Spec):
     """A plain list of echoes."""
 
     kind: Literal["Echoes"] = "Echoes"
+    satellites: tuple[_SatId, ...] | None = None
+    """Those that have echoes; None: all."""
     echoes: tuple[Echo, ...] = Field(min_length=1, max_length=64)
 
     def start(self, seed):
@@ -103,6 +108,8 @@ class Aeronautical(_Spec):
     """
 
     kind: Literal["Aeronautical"] = "Aeronautical"
+    satellites: tuple[_SatId, ...] | None = None
+    """Those that have echoes; None: all."""
     elevation_deg: float = Field(10.0, gt=0, le=90)
     fuselage_power_db: float | None = Field(-14.2, ge=-100, le=0)  # None: no fuselage echo
     fuselage_delay_s: float = Field(1.5e-9, ge=0, le=1e-7)  # assumed within the sourced 1 to 2 ns

@@ -155,7 +155,7 @@ class SyntheticSource:
         rows = [np.zeros(0, ECHO_TRUTH)]
         for row, run in self.echoes.items():
             satellite = self.sky.satellites[row]
-            for k, i in enumerate(index):
+            for i in index:
                 t_s = i / self.fs_hz
                 gain, delay_s = run.series(t_s, 1.0, 1)
                 part = np.zeros(run.n_echo, ECHO_TRUTH)
