@@ -204,7 +204,9 @@ def campaign(
     /,
     *,
     output: Out = None,
-    workers: Annotated[int | None, Parameter(help="Local processes; the results do not depend on it.")] = None,
+    workers: Annotated[
+        int | None, Parameter(help="Local processes; the results do not depend on it.")
+    ] = None,
     scheduler: Annotated[str | None, Parameter(help="Dask scheduler, e.g. tcp://127.0.0.1:8786.")] = None,
     confirm: Annotated[
         int | None, Parameter(help="Rerun this point on IF samples and say whether the two agree.")

@@ -10,6 +10,7 @@ import concurrent.futures as futures
 import contextlib
 import io
 import json
+import math
 import os
 import struct
 import time
@@ -401,6 +402,7 @@ class _Cluster:
 
         logging.getLogger("distributed").setLevel(logging.CRITICAL)
         self.address, self._path = address, path
+        self._threads, self._counted_at = 1, -math.inf
         try:
             self._client = distributed.Client(address, timeout=CONNECT_S, set_as_default=False)
         except (OSError, ValueError, TimeoutError) as err:
@@ -411,7 +413,13 @@ class _Cluster:
     @property
     def workers(self) -> int:
         """Threads of all workers now."""
-        return max(1, sum(self._client.nthreads().values()))
+        if time.monotonic() - self._counted_at > 1.0:
+            try:
+                self._threads = max(1, sum(self._client.nthreads().values()))
+            except (OSError, RuntimeError):
+                raise OSError(self._lost()) from None
+            self._counted_at = time.monotonic()
+        return self._threads
 
     def submit(self, function: Callable, *args: Any) -> futures.Future:
         """A future of ``function(*args)``."""
@@ -499,7 +507,7 @@ def _result(crew: Any, f: futures.Future, out: dict) -> Iterator[tuple[Any, Any]
             out[crew.submit(again[1], *again[2])] = again
         return
     except Exception as err:
-        if type(err).__name__ == "KilledWorker":
+        if type(err).__module__.startswith("distributed"):
             crew.revive()
         raise
     del out[f]
