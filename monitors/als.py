@@ -239,7 +239,7 @@ def als_model(
         )
     scale = np.where(counts > 0, 1.0 / np.maximum(counts, 1.0), 0.0)
     known, columns = known * scale, columns * scale
-    basis = [tuple(int(x) for x in pair) for pair in pairs]
+    basis = [(int(a), int(b)) for a, b in pairs]
     end_columns = parts[2:]
     if joint_q:
         columns = np.concatenate([columns, known[1:2]])
@@ -402,14 +402,15 @@ class AlsRun:
             return None
         self._seen = 0
         spec = self.spec
-        options = {
-            "n_lags": spec.n_lags,
-            "full": spec.full,
-            "settle": spec.settle_epochs,
-            "joint_q": spec.joint_q,
-        }
         try:
-            self.result = estimate(filt.log(need), self.rows, **options)
+            self.result = estimate(
+                filt.log(need),
+                self.rows,
+                n_lags=spec.n_lags,
+                full=spec.full,
+                settle=spec.settle_epochs,
+                joint_q=spec.joint_q,
+            )
         except (ValueError, np.linalg.LinAlgError) as error:
             self.unavailable = str(error)
             return None

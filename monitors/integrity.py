@@ -129,7 +129,7 @@ class IntegrityRun:
 
     def _parallel(self, filt, log, raw, h, seen, dx, lacks) -> tuple[BankReport | None, np.ndarray | None]:
         """Parallel filters about the trajectory that was not corrected since their last epoch: z = r + H moved."""
-        if self._bank is None:
+        if self._bank is None or self.spec.parallel_filters is None:
             return None, None
         kernels.chain(self._phi, self._qd, log.phi[0], log.qd[0])
         self._moved = log.phi[0] @ self._moved

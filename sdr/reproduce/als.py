@@ -24,7 +24,7 @@ def monte_carlo(log, p0, sigma_m, settle, n_d, n_lags, runs, seed, full=False, j
     options = {"n_lags": n_lags, "full": full, "settle": settle, "joint_q": joint_q}
     model = als.als_model(window, **options)
     r, _ = eskf.replay(window, p0, np.broadcast_to(np.square(sigma_m), N_SATS), runs, seed, qd_scale)
-    out = {"sigma": [], "off": [], "plain_sigma": [], "plain_off": [], "q": [], "condition": 0.0}
+    out: dict[str, list] = {key: [] for key in ("sigma", "off", "plain_sigma", "plain_off", "q", "condition")}
     for i in range(runs):
         sample = als.autocovariance(r[:, i], window.used, n_lags, settle)
         result = als.solve(model, sample)
@@ -33,7 +33,7 @@ def monte_carlo(log, p0, sigma_m, settle, n_d, n_lags, runs, seed, full=False, j
         out["plain_sigma"].append(np.sqrt(np.diag(sample[0])))
         out["plain_off"].append(sample[0][UPPER])
         out["q"].append(result.q_scale)
-        out["condition"] = max(out["condition"], result.condition)
+        out["condition"].append(result.condition)
     return {key: np.array(value) for key, value in out.items()}
 
 
@@ -87,7 +87,7 @@ def rows_of(mc: dict, sigma: float, n_d: int, n_lags: int, rate_hz: float) -> li
         rows.append(row(f"sigma ALS N=2, {where}", sigma, mean, low, high, verdict, "'right on' (fig. 5, 9)"))
         value, s_low, s_high = std_interval(mc["sigma"])
         floor = sigma / np.sqrt(2 * n_d)
-        note = f"floor sigma/sqrt(2 Nd) = {floor:.3f}; cond(M) {mc['condition']:.2f}"
+        note = f"floor sigma/sqrt(2 Nd) = {floor:.3f}; cond(M) {mc['condition'].max():.2f}"
         rows.append(row(f"std of one estimate N=2, {where}", None, value, s_low, s_high, "not stated", note))
     return rows
 

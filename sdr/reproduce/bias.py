@@ -51,7 +51,7 @@ def delays(log_p: np.ndarray, index: int, start: int = 0) -> np.ndarray:
     return np.where(above.any(axis=1), above.argmax(axis=1) + 1.0, np.inf)
 
 
-def share(hits: np.ndarray) -> tuple[float, float, float]:
+def share(hits) -> tuple[float, float, float]:
     """Rate with its Clopper-Pearson interval."""
     k, n = int(hits.sum()), int(hits.size)
     return (k / n, *clopper_pearson(k, n))

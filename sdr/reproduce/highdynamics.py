@@ -34,7 +34,7 @@ class Problem(NamedTuple):
     dt_s: float
 
 
-def acceleration_enu(t_s: np.ndarray) -> np.ndarray:
+def acceleration_enu(t_s: np.ndarray | float) -> np.ndarray:
     """Acceleration (..., 3): sinusoids that start and end every period with zero mean velocity."""
     return ACCEL_MPS2 * np.cos(2 * np.pi * np.asarray(t_s)[..., None] / PERIOD_S)
 

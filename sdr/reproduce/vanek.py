@@ -121,10 +121,9 @@ def simulate(
     limits, ints = bank.numbers()
     traced = min(traces, runs)
     shape = traced, T_END
-    out = Outcome(
-        np.zeros(runs, dtype=np.int64), *(np.full((*shape, 3), np.nan) for _ in range(3)),
-        np.full((*shape, n), np.nan), np.full((*shape, n, n), np.nan), np.full((*shape, m), np.nan),
-    )  # fmt: skip
+    resid, resid_var, chi = np.full((3, *shape, 3), np.nan)
+    x, p, r_hat = (np.full((*shape, *tail), np.nan) for tail in ((n,), (n, n), (m,)))
+    out = Outcome(np.zeros(runs, dtype=np.int64), resid, resid_var, chi, x, p, r_hat)
     other = np.zeros(runs, dtype=np.int64)
     rmd = noise_rmd.NoiseRmd(window=n_r, scheme="printed", pairing="two_channel")
     empty = np.zeros((0, 0, 3))
@@ -185,7 +184,7 @@ def fault_row(item: str, published: float, out: Outcome, note: str = "") -> dict
     rate = missed / clean
     low, high = clopper_pearson(missed, clean)
     hits = round(published * 10)
-    p_value = float(fisher_exact([[hits, 10 - hits], [missed, clean - missed]])[1])
+    p_value = float(fisher_exact(np.array([[hits, 10 - hits], [missed, clean - missed]]))[1])
     verdict = "reproduced" if p_value > 0.05 else "not reproduced"
     published_ci = clopper_pearson(hits, 10)
     when = f"delay 50/95 % {np.median(delay):.0f}/{np.quantile(delay, 0.95):.0f} s; " if delay.size else ""
@@ -205,7 +204,8 @@ def batches_of_ten(out: Outcome) -> str:
 
 def table_rows(s: Scene, runs: int, seed: int) -> tuple[list[dict], dict]:
     """Tables 2-4 with the matching geometry, and the false alarms."""
-    rows, kept = [], {}
+    rows: list[dict] = []
+    kept: dict = {}
     bank = spec()
     tables = (
         ("Table 2 step", STEPS, step_fault, None, "ft"),
@@ -240,7 +240,7 @@ def alarm_row(item: str, hits: int, runs: int, note: str = "") -> dict:
 
 def variant_rows(runs: int, seed: int) -> list[dict]:
     """What the thesis leaves open or recommends: geometry, tuning, printed F44, short and long windows, appendix B."""
-    rows = []
+    rows: list[dict] = []
     s = scene("G*")
 
     def add(item, where, bank, fault, note="", **options):
