@@ -15,6 +15,7 @@ from tracking.kernels import CHANNEL, HISTORY, KIND_CA, KIND_DATA, KIND_PILOT, S
 from tracking.lock import STATE_BIT_SYNC, STATE_IDLE, STATE_LOCKED, STATE_LOST, STATE_PULL_IN
 from tracking.loops import MAX_BT, dll_gains, fll_gain, pll_gains
 from tracking.records import AIDING, EPOCH, REPLICA
+from tracking.vector_ir import HAS_INTEGER_PATH
 
 __all__ = [
     "STATE_BIT_SYNC",
@@ -117,7 +118,11 @@ class E1Tracking(_Loops):
 
 
 class TrackingSpec(BaseModel):
-    """Section ``[tracking]``: loops, taps and lock detectors of all channels."""
+    """Section ``[tracking]``: loops, taps and lock detectors of all channels.
+
+    ``arithmetic``: "auto" correlates int8 samples in 16-bit integers where the processor allows (-90 dB), everything
+    else in single precision (-100 dB); "float" never uses integers, for results that are alike on all processors.
+    """
 
     model_config = _FROZEN
     l1ca: L1caTracking = L1caTracking()
@@ -133,6 +138,7 @@ class TrackingSpec(BaseModel):
     settle_fll_bw_hz: float = Field(2.0, ge=0.0, le=10.0)
     settle_dll_bw_hz: float = Field(2.0, gt=0.0, le=10.0)
     threads: int = Field(1, ge=1, le=64)
+    arithmetic: Literal["auto", "float"] = "auto"
 
     @model_validator(mode="after")
     def _hysteresis(self):
@@ -414,13 +420,13 @@ class Tracker:
         counts = np.zeros(shape[0], np.int64)
         self.symbols = np.zeros((shape[0], n_max + HISTORY // 4), SYMBOL)
         self.symbol_counts = np.zeros(shape[0], np.int64)
-        active = np.flatnonzero(
-            (self.channels["state"] != STATE_IDLE) & (self.channels["state"] != STATE_LOST)
-        )
+        active = self._running()
+
+        integer = int(HAS_INTEGER_PATH and self._buffer.dtype == np.int8 and self.spec.arithmetic == "auto")
 
         def run(which):
             track_slab(
-                which, self._buffer[0], self._buffer[1], self._first, n, self.fs_hz, self.if_hz, self._pool,
+                which, integer, self._buffer[0], self._buffer[1], self._first, n, self.fs_hz, self.if_hz, self._pool,
                 self._tap_q, self._secondary, self.channels, self._acc, self._hist, self._commands, epochs, counts,
                 corr, self.symbols, self.symbol_counts,
             )  # fmt: skip
@@ -434,6 +440,11 @@ class Tracker:
             list(self._threads.map(run, parts))
         self._keep_tail()
         return epochs, counts, corr
+
+    def _running(self):
+        """Indices of channels that take samples."""
+        state = self.channels["state"]
+        return np.flatnonzero((state != STATE_IDLE) & (state != STATE_LOST))
 
     def _append(self, n0, iq):
         """Put the slab behind the samples that are left over."""
@@ -460,8 +471,7 @@ class Tracker:
 
     def _keep_tail(self):
         """Move the samples that some channel still needs to the front."""
-        running = np.isin(self.channels["state"], (STATE_PULL_IN, STATE_BIT_SYNC, STATE_LOCKED))
-        needed = min(int(np.min(self.channels["next_sample"][running], initial=self._end)), self._end)
+        needed = int(np.min(self.channels["next_sample"][self._running()], initial=self._end))
         left = self._end - needed
         start = needed - self._first
         self._buffer[:, :left] = self._buffer[:, start : start + left].copy()

@@ -36,6 +36,18 @@ from tracking.lock import (
     cn0_noise_reference_dbhz,
     code_lock,
 )
+from tracking.vector_ir import (
+    HAS_INTEGER_PATH,
+    INTEGER_SCALE,
+    TABLE_ONE,
+    WIDTH,
+    dot3,
+    dot4,
+    dot5,
+    dot6,
+    fused4,
+    wipe,
+)
 
 __all__ = ["CHANNEL", "HISTORY", "SYMBOL", "track_slab"]
 
@@ -272,8 +284,8 @@ def _dot4(wi, wq, n, pool, s0, s1, s2, s3, out, o):
 
 
 @njit(nogil=True)
-def _correlate_block(xi, xq, a, n, ct, sn, pool, starts, n_sums, wi, wq, out):
-    """All sums of one block into ``out`` (I, Q interleaved); ``starts`` is padded to a multiple of four."""
+def _float_block(xi, xq, a, n, ct, sn, pool, starts, n_sums, wi, wq, out):
+    """All sums of one block into ``out`` (I, Q interleaved); ``starts`` is padded."""
     if n_sums <= 4:
         _fused4(xi, xq, a, n, ct, sn, pool, starts[0], starts[1], starts[2], starts[3], out)
     elif n_sums <= 7:
@@ -287,9 +299,56 @@ def _correlate_block(xi, xq, a, n, ct, sn, pool, starts, n_sums, wi, wq, out):
             _dot4(wi, wq, n, pool, starts[t], starts[t + 1], starts[t + 2], starts[t + 3], out, 2 * t)
 
 
+if HAS_INTEGER_PATH:
+
+    @njit(nogil=True)
+    def _integer_block(x, y, c, s, table, starts, steps, n_sums, u, v, to):
+        """int32 sums of 16 ``steps`` samples (``vector_ir``); all arguments but the counts are addresses."""
+        if n_sums <= 4:
+            fused4(x, y, c, s, table, starts, steps, to)
+            return
+        wipe(x, y, c, s, steps, u, v)
+        left = n_sums
+        while left > 0:
+            if left > 10 or left == 6:
+                dot6(u, v, table, starts, steps, to)
+                k = 6
+            elif left == 5 or left > 8:
+                dot5(u, v, table, starts, steps, to)
+                k = 5
+            elif left == 4 or left > 6:
+                dot4(u, v, table, starts, steps, to)
+                k = 4
+            else:
+                dot3(u, v, table, starts, steps, to)
+                k = 3
+            starts, to, left = starts + 8 * k, to + 8 * k, left - k
+
+else:
+
+    @njit(nogil=True)
+    def _integer_block(x, y, c, s, table, starts, steps, n_sums, u, v, to):
+        pass
+
+
 @njit(nogil=True)
-def _carrier_table(step_cycles, ct, sn):
+def _remainder(xi, xq, a, n, done, carrier, pool, starts, n_sums, work, out):
+    """Add the last samples of a block, fewer than the integer loops' step, in single precision."""
+    ct, sn, _, _ = carrier
+    wi, wq, _, rest = work
+    for t in range(n_sums):
+        starts[t] += _U(done)
+    _float_block(
+        xi, xq, _U(a + done), _U(n - done), ct[done:], sn[done:], pool, starts, n_sums, wi, wq, rest
+    )  # fmt: skip
+    for k in range(2 * n_sums):
+        out[k] += rest[k]
+
+
+@njit(nogil=True)
+def _carrier_table(step_cycles, carrier):
     """exp(2 pi i step j), j < 1024, as 32 x 32 products of rotations built in double precision."""
+    ct, sn, ci, si = carrier
     bc, bs = np.empty(32, np.float32), np.empty(32, np.float32)
     c1, s1 = math.cos(_TWO_PI * step_cycles), math.sin(_TWO_PI * step_cycles)
     c, s = 1.0, 0.0
@@ -304,16 +363,57 @@ def _carrier_table(step_cycles, ct, sn):
             ct[32 * m + j] = bc[j] * fc - bs[j] * fs
             sn[32 * m + j] = bc[j] * fs + bs[j] * fc
         c, s = c * c32 - s * s32, c * s32 + s * c32
+    for j in range(_BLOCK):
+        ci[j] = np.int16(math.floor(ct[j] * _F(TABLE_ONE) + _F(0.5)))
+        si[j] = np.int16(math.floor(sn[j] * _F(TABLE_ONE) + _F(0.5)))
 
 
 @njit(nogil=True)
-def _correlate_period(st, xi, xq, a0, n, theta, step, rate, ct, sn, pool, tap_q, starts, wi, wq, out, sums):
-    """One code period: ``sums`` (n_sums + 1 complex as pairs; the last is the prompt's second half).
+def _place_taps(st, q0, tap_q, starts):
+    """Where each tap's code values of a block start in the pool, for a replica phase of ``q0`` in 1/P samples.
 
-    theta, step: carrier phase at the first sample and its advance per sample, cycles. Returns the sum over
-    samples of (replica's phase - nominal phase), chips, at the mean of E and L.
+    Returns by how much E and L are off on average because the period is no whole number of 1/P samples, in 1/P samples.
     """
     n_sums, shift, mask = st.n_sums, st.phase_shift, st.n_phase - 1
+    wrap, columns, start = st.wrap_q, st.table_columns, st.table_start
+    q0 %= wrap
+    for t in range(n_sums):
+        q = q0 + tap_q[t]
+        if q < 0:
+            q += wrap
+        elif q >= wrap:
+            q -= wrap
+        starts[t] = _U(start + (q & mask) * columns + (q >> shift))
+    if n_sums > st.n_taps + 1:
+        starts[n_sums - 1] += _U(st.data_table_start - start)
+    if st.wrap_error_q == 0.0:
+        return 0.0
+    wraps = 0.0
+    for t in (st.early, st.late):
+        wraps += 1.0 if q0 + tap_q[t] < 0 else 0.0
+        wraps -= 1.0 if q0 + tap_q[t] >= wrap else 0.0
+    return 0.5 * wraps * st.wrap_error_q
+
+
+@njit(nogil=True)
+def _correlate_period(
+    st, integer, xi, xq, a0, n, theta, step, rate, carrier, pool, tap_q, starts, work, out, sums
+):
+    """One code period: ``sums`` (n_sums + 1 complex as pairs; the last is the prompt's second half).
+
+    theta, step: carrier phase at the first sample and its advance per sample, cycles. Returns the sum over samples of
+    (replica's phase - nominal phase), chips, at the mean of E and L.
+    """
+    n_sums, prompt, n_phase, per_chip, phase = (
+        st.n_sums, st.prompt, st.n_phase, st.samples_per_chip, st.code_phase_chips,
+    )  # fmt: skip
+    ct, sn, ci, si = carrier
+    wi, wq, whole, _ = work
+    x, y = xi.ctypes.data + a0, xq.ctypes.data + a0
+    c_at, s_at, table, starts_at, to = (
+        ci.ctypes.data, si.ctypes.data, pool.ctypes.data, starts.ctypes.data, whole.ctypes.data,
+    )  # fmt: skip
+    u, v = wi.ctypes.data, wq.ctypes.data
     blocks = 2 * ((n + 2 * _BLOCK - 1) // (2 * _BLOCK))
     block = min(_BLOCK, ((n + blocks - 1) // blocks + 31) // 32 * 32)
     n_blocks = (n + block - 1) // block
@@ -325,30 +425,25 @@ def _correlate_period(st, xi, xq, a0, n, theta, step, rate, ct, sn, pool, tap_q,
     for b in range(n_blocks):
         a = b * block
         nb = min(block, n - a)
-        middle = st.code_phase_chips + (a + 0.5 * nb) * rate
-        q0 = math.floor((middle * st.samples_per_chip - 0.5 * nb) * st.n_phase + 0.5)
-        delta = (q0 / st.n_phase + 0.5 * nb) / st.samples_per_chip - middle
-        for t in range(n_sums):
-            q = np.int64(q0) + tap_q[t]
-            wrapped = 0.0
-            while q < 0:
-                q += st.wrap_q
-                wrapped += st.wrap_error_q
-            while q >= st.wrap_q:
-                q -= st.wrap_q
-                wrapped -= st.wrap_error_q
-            if wrapped != 0.0 and (t == st.early or t == st.late):
-                delta += 0.5 * wrapped / (st.n_phase * st.samples_per_chip)
-            base = st.data_table_start if t > st.n_taps else st.table_start
-            starts[t] = _U(base + (q & mask) * st.table_columns + (q >> shift))
-        rounding += delta * nb
-        _correlate_block(xi, xq, _U(a0 + a), _U(nb), ct, sn, pool, starts, n_sums, wi, wq, out)
+        middle = phase + (a + 0.5 * nb) * rate
+        q0 = math.floor((middle * per_chip - 0.5 * nb) * n_phase + 0.5)
+        wraps = _place_taps(st, np.int64(q0), tap_q, starts)
+        rounding += (((q0 + wraps) / n_phase + 0.5 * nb) / per_chip - middle) * nb
+        if integer:
+            steps = nb // WIDTH
+            _integer_block(x + a, y + a, c_at, s_at, table, starts_at, steps, n_sums, u, v, to)
+            for k in range(2 * n_sums):
+                out[k] = _F(whole[k]) * _F(1.0 / INTEGER_SCALE)
+            if steps * WIDTH < nb:
+                _remainder(xi, xq, a0 + a, nb, steps * WIDTH, carrier, pool, starts, n_sums, work, out)
+        else:
+            _float_block(xi, xq, _U(a0 + a), _U(nb), ct, sn, pool, starts, n_sums, wi, wq, out)
         for t in range(n_sums):
             re, im = np.float64(out[2 * t]), np.float64(out[2 * t + 1])
             sums[2 * t] += re * c + im * s
             sums[2 * t + 1] += im * c - re * s
         if 2 * b >= n_blocks:
-            re, im = np.float64(out[2 * st.prompt]), np.float64(out[2 * st.prompt + 1])
+            re, im = np.float64(out[2 * prompt]), np.float64(out[2 * prompt + 1])
             sums[2 * n_sums] += re * c + im * s
             sums[2 * n_sums + 1] += im * c - re * s
         c, s = c * dc - s * ds, c * ds + s * dc
@@ -1029,14 +1124,16 @@ def _accumulate(st, acc, sums, n, sign):
 
 
 @njit(cache=True, nogil=True)
-def track_slab(which, xi, xq, first, n_avail, fs_hz, if_hz, pool, tap_q, secondary, ch, acc, hist, commands, epochs,
-               counts, corr, symbols, symbol_counts):  # fmt: skip
+def track_slab(which, integer, xi, xq, first, n_avail, fs_hz, if_hz, pool, tap_q, secondary, ch, acc, hist,
+               commands, epochs, counts, corr, symbols, symbol_counts):  # fmt: skip
     """Take the channels ``which`` through every whole code period of the samples.
 
     Parameters
     ----------
     which : int64 (W,)
         Channels to run.
+    integer : int
+        1: 16-bit integer loops (int8 samples where ``vector_ir.HAS_INTEGER_PATH``); 0: single precision.
     xi, xq : int8 | int16 | float32 (>= n_avail,)
         Samples ``first`` .. ``first + n_avail - 1``.
     pool : int8 (n,)
@@ -1052,10 +1149,17 @@ def track_slab(which, xi, xq, first, n_avail, fs_hz, if_hz, pool, tap_q, seconda
         Outputs; ``counts`` and ``symbol_counts`` int64 (C,) say how many rows are filled.
     """
     n_columns = tap_q.shape[1]
-    ct, sn = np.empty(_BLOCK, np.float32), np.empty(_BLOCK, np.float32)
-    wi, wq = np.empty(_BLOCK, np.float32), np.empty(_BLOCK, np.float32)
+    carrier = (
+        np.empty(_BLOCK, np.float32), np.empty(_BLOCK, np.float32),
+        np.empty(_BLOCK, np.int16), np.empty(_BLOCK, np.int16),
+    )  # fmt: skip
+    wide = 2 * n_columns + 16
+    work = (
+        np.empty(_BLOCK, np.float32), np.empty(_BLOCK, np.float32),
+        np.zeros(wide, np.int32), np.zeros(wide, np.float32),
+    )  # fmt: skip
     starts = np.zeros(n_columns + 8, np.uint64)
-    out = np.zeros(2 * n_columns + 16, np.float32)
+    out = np.zeros(wide, np.float32)
     sums = np.zeros(2 * n_columns + 4)
     end = first + n_avail
     if_step = if_hz / fs_hz
@@ -1079,7 +1183,7 @@ def track_slab(which, xi, xq, first, n_avail, fs_hz, if_hz, pool, tap_q, seconda
             if st.next_sample + n > end:
                 break
             if rough != table_hz:
-                _carrier_table((if_hz + rough) / fs_hz, ct, sn)
+                _carrier_table((if_hz + rough) / fs_hz, carrier)
                 table_hz = rough
             turns = if_step * st.next_sample
             theta = turns - math.floor(turns) + st.carrier_cycles
@@ -1088,8 +1192,8 @@ def track_slab(which, xi, xq, first, n_avail, fs_hz, if_hz, pool, tap_q, seconda
             if st.kind == KIND_PILOT and st.state == STATE_LOCKED:
                 sign = secondary[(st.code_period + st.symbol_phase) % 25]
             rounding = _correlate_period(
-                st, xi, xq, st.next_sample - first, n, theta, (if_hz + rough) / fs_hz, rate, ct, sn, pool, tap_q[c],
-                starts, wi, wq, out, sums,
+                st, integer, xi, xq, st.next_sample - first, n, theta, (if_hz + rough) / fs_hz, rate, carrier, pool,
+                tap_q[c], starts, work, out, sums,
             )  # fmt: skip
             st.rounding_sum += rounding
             _accumulate(st, acc[c], sums, n, sign)
