@@ -5,8 +5,10 @@ telemetry decodes, and at navigation epochs the channels' states at one common s
 start time and no almanac enters: everything known of the sky was decoded from the samples.
 """
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import count
 from typing import Any, Protocol
 
 import numpy as np
@@ -72,16 +74,23 @@ class Receiver:
         self._wanted = self._dwell_samples()
 
     def __iter__(self) -> Iterator[Outcome]:
-        # Whole navigation epochs fit into slabs: a position is taken at the slab's last sample.
-        slab = round(self.spec.slab_ms * 1e-3 * self.fs_hz)
-        every = max(1, round(1.0 / (self.spec.navigation.rate_hz * self.spec.slab_ms * 1e-3)))
-        k = 0
-        while True:
-            n0, iq = self.source.read(slab)
-            if iq.shape[1] == 0:
+        # The first slab is what one search takes; after it, slabs divide the time between positions.
+        period_s = 1.0 / self.spec.navigation.rate_hz
+        per_period = math.ceil(period_s / (self.spec.slab_ms * 1e-3) - 1e-9)
+        ends = (round(k * period_s / per_period * self.fs_hz) for k in count(1))
+        for k, end in enumerate(ends, 1):
+            if self.position == 0 and self._wanted < end:
+                yield from self._read(self._wanted, navigate=False)
+            n = end - self.position
+            outcome = list(self._read(n, navigate=k % per_period == 0))
+            yield from outcome
+            if not outcome or outcome[0].n_end - outcome[0].n0 < n:
                 return
-            k += 1
-            yield self._advance(n0, iq, navigate=k % every == 0)
+
+    def _read(self, n: int, navigate: bool) -> Iterator[Outcome]:
+        n0, iq = self.source.read(n)
+        if iq.shape[1]:
+            yield self._advance(n0, iq, navigate)
 
     def _advance(self, n0: int, iq: np.ndarray, navigate: bool) -> Outcome:
         n_end = n0 + iq.shape[1]
