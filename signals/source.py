@@ -102,7 +102,8 @@ class SyntheticSource:
         rows = [np.full(run.n_echo, row) for row, run in self.echoes.items()]
         self._rows = np.concatenate([np.arange(len(sky.satellites)), *rows]).astype(np.int64)
         self._segment = (-1, np.zeros(0, np.int8), self._components)
-        self.front_end = front_end.start(self._rms(duration_s))
+        own = np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, 1))
+        self.front_end = front_end.start(self._rms(duration_s), own)
         self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
         self._ahead = 2 * threads if threads > 1 else 1
         self._pending: deque[Future | tuple] = deque()
@@ -186,7 +187,10 @@ class SyntheticSource:
             self._pending.append(job if self._pool is None else self._pool.submit(self._make, *job))
             self._next_cell += 1
         head = self._pending.popleft()
-        return self._make(*head) if isinstance(head, tuple) else head.result()
+        cell = self._make(*head) if isinstance(head, tuple) else head.result()
+        if not self.front_end.streaming:
+            return cell
+        return self.front_end.push(cell, last=not self._pending and self._next_cell == self._n_cells)
 
     def _first_block(self, cell: int) -> int:
         """First block with its middle at or after the beginning of the cell, in exact arithmetic."""
@@ -272,7 +276,7 @@ class SyntheticSource:
             self._seed, self._sigma, first * BLOCK, n_start, self.fs_hz / CELLS_PER_S,
             components, code, carrier, gain, periods, self._codes, symbols,
         )  # fmt: skip
-        if self.spec.bits == 8 and not self.jammers and self.complex:
+        if self.spec.bits == 8 and not self.jammers and self.complex and not self.front_end.streaming:
             out = np.empty((2, n), np.int8)
             synthesise_int8(out, self.front_end.gain, *args)
             return out
@@ -280,6 +284,8 @@ class SyntheticSource:
         synthesise(iq, *args)
         for jammer in self.jammers:
             jammer.add(iq, first * BLOCK)
+        if self.front_end.streaming:
+            return iq
         if not self.complex:
             iq[1] = 0.0
         return self.front_end(iq)
