@@ -102,3 +102,20 @@ ODOMETER = np.dtype(
     ]
 )
 """One output of the wheel speed sensor."""
+
+STEERING = np.dtype(
+    [
+        ("sample_index", "u8"),
+        ("t_s", "f8"),
+        ("state", "u1"),  # nav.ultratight: SCALAR, STEERED, COASTING, LOST
+        ("n_steered", "i4"),  # channels under command
+        ("n_used", "i4"),  # of them with a usable C/N0
+        ("nis", "f8"),  # normalised innovations squared, sum over the rows
+        ("rows", "i4"),
+        ("sigma_2d_m", "f8"),
+        ("sigma_range_m", "f8"),  # worst predicted range and rate
+        ("sigma_rate_mps", "f8"),
+        ("cn0_median_dbhz", "f8"),
+    ]
+)
+"""What the steering filter did in one epoch."""

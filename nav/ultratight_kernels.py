@@ -1,0 +1,628 @@
+"""Compiled steps of the vector and ultra-tight receivers: predict, update from discriminators, steer.
+
+One filter for four error models (integer code): the two RISS forms, the 17-state strapdown model, and position, velocity,
+clock alone (``KINEMATIC``, the vector receiver). Every model has one more error state at its end, the inter-system bias.
+The nominal state is a flat array ``x`` (N_X,) whose layout depends on the model; columns from ``ACC`` on are common.
+
+Innovation about the NCO. A discriminator sees e = g (true - NCO) + noise, g <= 1 its gain at this C/N0. With
+off = NCO - predicted, z = e + g off has the row g [-u' T_p + e_b] and the variance of the discriminator.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from nav.errormodels import ecef17_f
+from nav.eskf_kernels import discretise, innovation_covariance, update
+from nav.frames import position_map_geodetic, rotation_enu_to_ecef
+from nav.kernels import predict_ranges
+from nav.riss import (
+    AZIMUTH,
+    CLOCK_BIAS,
+    CLOCK_DRIFT,
+    GYRO_BIAS,
+    HEIGHT,
+    LAT,
+    LON,
+    ODO_ACCEL,
+    PAPER,
+    PITCH,
+    PITCH_ERROR,
+    SCALE,
+    SCALE_FACTOR,
+    SPEED,
+    VE,
+    VN,
+    VU,
+    riss11_f,
+    riss_pos_vel,
+    riss_sf_f,
+    riss_sf_velocity,
+    riss_step,
+)
+from nav.strapdown import strapdown_step
+from signals.constants import C_MPS, CHIP_RATE_HZ, EARTH_RATE_RAD_S, F_L1_HZ, METRES_PER_CHIP, WAVELENGTH_M
+from signals.geometry_kernels import orbit_kernel
+from tracking.lock import STATE_LOCKED
+
+ECEF17, KINEMATIC = 2, 3
+"""Model codes beside ``riss.PAPER`` and ``riss.SCALE``."""
+N_X, ACC, ISB = 32, 27, 30
+"""Length of the nominal state; ECEF acceleration (3) of the last prediction; inter-system bias, m."""
+
+N_CN0 = 6
+"""Columns of a channel's power monitor: prompt power fast and slow, noise power fast, weight of each, C/N0 (Hz)."""
+P_FAST, P_SLOW, N_FAST, WEIGHT, NIS_MEAN, CN0_HZ = range(6)
+
+TABLE_LOW_DB, TABLE_STEP_DB = -20.0, 0.5
+"""Grid of the discriminator table: C/N0 T in dB; columns code gain, code variance (chips^2), frequency gain and
+variance of frequency x T / 2 (cycles^2)."""
+
+N_SENSOR = 7
+"""Sensor columns: gyro x y z rad/s, specific force x y z m/s^2 (forward, right, down), odometer m/s."""
+
+
+# ---------------------------------------------------------------------------------------------- the error models
+
+
+@njit(cache=True, nogil=True)
+def clock_states(model):
+    """Indices of clock bias and drift among the error states."""
+    if model == PAPER:
+        return 9, 10
+    if model == SCALE:
+        return 7, 8
+    if model == ECEF17:
+        return 15, 16
+    return 6, 7
+
+
+@njit(cache=True, nogil=True)
+def clock_columns(model):
+    """Columns of clock bias and drift in the nominal state."""
+    if model <= SCALE:
+        return CLOCK_BIAS, CLOCK_DRIFT
+    if model == ECEF17:
+        return 21, 22
+    return 6, 7
+
+
+@njit(cache=True, nogil=True)
+def position_velocity(model, x, pos, vel):
+    """ECEF position and velocity of a nominal state into ``pos``, ``vel`` (3,)."""
+    if model <= SCALE:
+        riss_pos_vel(x, pos, vel)
+    else:
+        for i in range(3):
+            pos[i], vel[i] = x[i], x[3 + i]
+
+
+@njit(cache=True, nogil=True)
+def maps(model, x, tp, tv):
+    """T_p, T_v (3, n): error states to ECEF position and velocity."""
+    tp[:] = 0.0
+    tv[:] = 0.0
+    if model <= SCALE:
+        t = position_map_geodetic(x[LAT], x[LON], x[HEIGHT])
+        r = rotation_enu_to_ecef(x[LAT], x[LON])
+        for i in range(3):
+            for j in range(3):
+                tp[i, j] = t[i, j]
+        if model == PAPER:
+            for i in range(3):
+                for j in range(3):
+                    tv[i, 3 + j] = r[i, j]
+        else:
+            v = np.empty((3, 3))
+            riss_sf_velocity(x, v)
+            for i in range(3):
+                for j in range(3):
+                    acc = r[i, 0] * v[0, j] + r[i, 1] * v[1, j] + r[i, 2] * v[2, j]
+                    tv[i, 3 + j if j < 2 else 6] = acc
+    else:
+        for i in range(3):
+            tp[i, i] = 1.0
+            tv[i, 3 + i] = 1.0
+
+
+@njit(cache=True, nogil=True)
+def _turn(c, psi):
+    """C <- exp([psi x]) C, ``c`` flat (9,); second order, for the small angles of a correction."""
+    for k in range(3):
+        a, b, d = c[k], c[3 + k], c[6 + k]
+        x1 = psi[1] * d - psi[2] * b
+        y1 = psi[2] * a - psi[0] * d
+        z1 = psi[0] * b - psi[1] * a
+        c[k] = a + x1 + 0.5 * (psi[1] * z1 - psi[2] * y1)
+        c[3 + k] = b + y1 + 0.5 * (psi[2] * x1 - psi[0] * z1)
+        c[6 + k] = d + z1 + 0.5 * (psi[0] * y1 - psi[1] * x1)
+
+
+@njit(cache=True, nogil=True)
+def inject(model, x, dx):
+    """Correct the nominal state by dx = true - estimate, in place."""
+    n = dx.size
+    x[ISB] += dx[n - 1]
+    ib, idr = clock_states(model)
+    cb, cd = clock_columns(model)
+    x[cb] += dx[ib]
+    x[cd] += dx[idr]
+    if model == PAPER:
+        x[LAT] += dx[0]
+        x[LON] += dx[1]
+        x[HEIGHT] += dx[2]
+        x[VE] += dx[3]
+        x[VN] += dx[4]
+        x[VU] += dx[5]
+        x[AZIMUTH] += dx[6]
+        x[ODO_ACCEL] += dx[7]
+        x[GYRO_BIAS] += dx[8]
+    elif model == SCALE:
+        x[LAT] += dx[0]
+        x[LON] += dx[1]
+        x[HEIGHT] += dx[2]
+        x[AZIMUTH] += dx[3]
+        x[SCALE_FACTOR] += dx[4]
+        x[GYRO_BIAS] += dx[5]
+        x[PITCH_ERROR] += dx[6]
+        x[PITCH] += dx[6]
+        v = (1.0 - x[SCALE_FACTOR]) * x[SPEED]
+        x[VE] = v * math.cos(x[PITCH]) * math.sin(x[AZIMUTH])
+        x[VN] = v * math.cos(x[PITCH]) * math.cos(x[AZIMUTH])
+        x[VU] = v * math.sin(x[PITCH])
+    else:
+        for i in range(6):
+            x[i] += dx[i]
+        if model == ECEF17:
+            _turn(x[6:15], dx[6:9])
+            for i in range(6):
+                x[15 + i] += dx[9 + i]
+
+
+@njit(cache=True, nogil=True)
+def predict(model, x, p, sensors, dt_s, filter_s, rates, q_diag, f, phi, qd):
+    """One navigation epoch ahead: nominal state through m sensor intervals, then P over the whole epoch.
+
+    Parameters
+    ----------
+    x (N_X,), p (n, n) : in place;  sensors (m, N_SENSOR);  dt_s : one sensor interval
+    filter_s : pitch low pass of RISS;  rates : 1 / correlation times of the model, 1/s;  q_diag (n,)
+    f, phi, qd (n, n) : work and outputs
+    """
+    m, n = sensors.shape[0], p.shape[0]
+    span = m * dt_s
+    pos, v0, v1 = np.empty(3), np.empty(3), np.empty(3)
+    position_velocity(model, x, pos, v0)
+    f[:] = 0.0
+    if model <= SCALE:
+        turn = 0.0
+        for k in range(m):
+            s = sensors[k]
+            riss_step(x, model, -s[2], s[3], s[4], s[6], dt_s, filter_s)
+            turn -= s[2] / m
+        if model == SCALE:
+            riss_sf_f(x, rates[0], rates[1], rates[2], f[: n - 1, : n - 1])
+        else:
+            riss11_f(x, turn, rates[0], rates[1], f[: n - 1, : n - 1])
+    elif model == ECEF17:
+        _strapdown_epoch(x, sensors, dt_s, rates, f)
+    else:
+        for i in range(3):
+            x[i] += x[3 + i] * span
+            f[i, 3 + i] = 1.0
+        x[6] += x[7] * span
+        f[6, 7] = 1.0
+    discretise(f, q_diag, span, phi, qd)
+    t = np.dot(phi, p)
+    for i in range(n):
+        for j in range(i, n):
+            acc = qd[i, j]
+            for k in range(n):
+                acc += t[i, k] * phi[j, k]
+            p[i, j] = acc
+            p[j, i] = acc
+    position_velocity(model, x, pos, v1)
+    for i in range(3):
+        x[ACC + i] = (v1[i] - v0[i]) / span
+
+
+@njit(cache=True, nogil=True)
+def _strapdown_epoch(x, sensors, dt_s, rates, f):
+    """Strapdown navigation of the 17-state model over one epoch, and its F."""
+    m = sensors.shape[0]
+    pos, vel = x[0:3].copy(), x[3:6].copy()
+    c = x[6:15].copy().reshape(3, 3)
+    middle, force = c.copy(), np.zeros(3)
+    a, g = np.empty(3), np.empty(3)
+    for k in range(m):
+        if k == m // 2:
+            middle[:] = c
+        for i in range(3):
+            g[i], a[i] = sensors[k, i] - x[18 + i], sensors[k, 3 + i] - x[15 + i]
+            force[i] += a[i] / m
+        strapdown_step(pos, vel, c, g, a, dt_s)
+    n = f.shape[0] - 1
+    ecef17_f(pos, middle, force, rates[0], rates[1], f[:n, :n])
+    x[0:3], x[3:6] = pos, vel
+    x[6:15] = c.reshape(9)
+    span = m * dt_s
+    for i in range(3):
+        x[15 + i] *= math.exp(-rates[0] * span)
+        x[18 + i] *= math.exp(-rates[1] * span)
+    x[21] += x[22] * span
+
+
+# --------------------------------------------------------------------------------------------- powers and variance
+
+
+@njit(cache=True, nogil=True)
+def look_up(table, snr, out):
+    """Interpolate the discriminator table at C/N0 T = ``snr`` into ``out`` (4,); its ends hold beyond it."""
+    last = table.shape[0] - 1
+    y = (10.0 * math.log10(max(snr, 1e-9)) - TABLE_LOW_DB) / TABLE_STEP_DB
+    y = min(max(y, 0.0), last - 1e-9)
+    i = int(y)
+    w = y - i
+    for c in range(4):
+        out[c] = (1.0 - w) * table[i, c] + w * table[i + 1, c]
+
+
+@njit(cache=True, nogil=True)
+def watch_power(row, prompt_power, noise_power, span_s, fast_s, slow_s):
+    """Fast and slow means of |P|^2 and of the noise tap's power, each per integration of the same length."""
+    w = row[WEIGHT] + span_s
+    kf, ks = span_s / min(w, fast_s + span_s), span_s / min(w, slow_s + span_s)
+    row[P_FAST] += kf * (prompt_power - row[P_FAST])
+    row[P_SLOW] += ks * (prompt_power - row[P_SLOW])
+    row[N_FAST] += kf * (noise_power - row[N_FAST])
+    row[WEIGHT] = min(w, 1e3)
+
+
+@njit(cache=True, nogil=True)
+def cn0_from_powers(power, active, span_s, cn0_out):
+    """C/N0 (Hz) of every channel from the fast means, as pessimistic as fast and slow, own and common noise allow.
+
+    C/N0 = (min(P_fast, P_slow) - N) / (N T), N the median of all channels' noise, or the own one where it is twice
+    that: a jammer that rises is in the common noise at once, one that hits a single code in its own.
+    """
+    n = power.shape[0]
+    noise = np.empty(n)
+    count = 0
+    for c in range(n):
+        if active[c]:
+            noise[count] = power[c, N_FAST] * span_s[c]
+            count += 1
+    if count == 0:
+        return
+    ordered = np.sort(noise[:count])
+    common = ordered[count // 2]
+    for c in range(n):
+        if not active[c]:
+            continue
+        own = power[c, N_FAST] * span_s[c]
+        density = own if own > 2.0 * common else common
+        prompt = min(power[c, P_FAST], power[c, P_SLOW])
+        value = prompt / max(density, 1e-30) - 1.0 / span_s[c]
+        cn0_out[c] = max(value, 0.5)
+        power[c, CN0_HZ] = cn0_out[c]
+
+
+# ------------------------------------------------------------------------------------------------- update and steer
+
+
+@njit(cache=True, nogil=True)
+def rows(model, x, n, los, second, gain_code, gain_rate, tp, tv, h):
+    """Range rows 0..C-1 and rate rows C..2C-1, scaled by the discriminators' gains."""
+    maps(model, x, tp, tv)
+    ib, idr = clock_states(model)
+    count = los.shape[0]
+    for c in range(count):
+        for j in range(n):
+            a = b = 0.0
+            for i in range(3):
+                a -= los[c, i] * tp[i, j]
+                b -= los[c, i] * tv[i, j]
+            h[c, j], h[count + c, j] = gain_code[c] * a, gain_rate[c] * b
+        h[c, ib] += gain_code[c]
+        h[c, n - 1] += gain_code[c] * second[c]
+        h[count + c, idr] += gain_rate[c]
+
+
+@njit(cache=True, nogil=True)
+def filter_update(model, x, p, h, z, var, used, power, limit, k, s, p_prior, dx):
+    """Update and inject; a row beyond ``limit`` sigma counts less, as much as brings it back to the limit.
+
+    A channel whose ranges stay beyond 3 sigma for a second while most others agree is sick and left out.
+    Returns (NIS over the rows before any inflation, rows used).
+    """
+    m = z.size
+    count = m // 2
+    p_prior[:] = p
+    innovation_covariance(p, h, var, used, s)
+    sick = trusted = 0
+    for c in range(count):
+        if used[c]:
+            ratio = z[c] * z[c] / s[c, c]
+            power[c, NIS_MEAN] += 0.02 * (min(ratio, 100.0) - power[c, NIS_MEAN])
+            trusted += 1
+            sick += power[c, NIS_MEAN] > 9.0
+    total, n_rows = 0.0, 0
+    for r in range(m):
+        if not used[r]:
+            continue
+        ratio = z[r] * z[r] / s[r, r]
+        total += ratio
+        n_rows += 1
+        c = r if r < count else r - count
+        if 3 * sick <= trusted and power[c, NIS_MEAN] > 9.0:
+            used[r] = False
+        elif limit > 0.0 and ratio > limit * limit:
+            extra = z[r] * z[r] / (limit * limit) - s[r, r]
+            var[r] += extra
+            s[r, r] += extra
+    update(p, h, var, used, z, k, dx)
+    inject(model, x, dx)
+    return total, n_rows
+
+
+@njit(cache=True, nogil=True)
+def range_acceleration(los, rho, rate, rel_vel2, sat_acc_los, acc):
+    """d2 rho / dt2 = (|dv|^2 - rho'^2) / rho + u . (a_sat - a_rx), m/s^2."""
+    a = sat_acc_los + (rel_vel2 - rate * rate) / rho
+    for i in range(3):
+        a -= los[i] * acc[i]
+    return a
+
+
+@njit(cache=True, nogil=True)
+def satellites_at(orbit, toe_toc_tgd, active, tow_whole, tow_frac, rho, pos, vel, acc, clock, rate):
+    """ECEF state, acceleration and clock of each active satellite at transmission, rho (C,) its pseudorange.
+
+    ``tow_whole + tow_frac`` is the receiver's GPS time of week; ``clock`` and ``rate`` in m and m/s, group delay
+    taken off (IS-GPS-200, 20.3.3.3.3).
+    """
+    half, week = 302_400.0, 604_800.0
+    for c in range(active.size):
+        if not active[c]:
+            continue
+        t = tow_frac - rho[c] / C_MPS
+        dt_toe = (tow_whole - toe_toc_tgd[c, 0] + half) % week - half + t
+        dt_toc = (tow_whole - toe_toc_tgd[c, 1] + half) % week - half + t
+        s = orbit_kernel(orbit[c], dt_toe, dt_toc)
+        s = orbit_kernel(orbit[c], dt_toe - s[6], dt_toc - s[6])
+        r2 = 0.0
+        for i in range(3):
+            pos[c, i], vel[c, i] = s[i], s[3 + i]
+            r2 += s[i] * s[i]
+        # Rotating frame: gravitation, Coriolis, centrifugal.
+        g = -3.986004418e14 / (r2 * math.sqrt(r2))
+        we = EARTH_RATE_RAD_S
+        acc[c, 0] = (g + we * we) * s[0] + 2.0 * we * s[4]
+        acc[c, 1] = (g + we * we) * s[1] - 2.0 * we * s[3]
+        acc[c, 2] = g * s[2]
+        clock[c] = C_MPS * (s[6] - toe_toc_tgd[c, 2])
+        rate[c] = C_MPS * s[7]
+
+
+@njit(cache=True, nogil=True)
+def pseudoranges(model, x, active, second, sat_pos, sat_vel, sat_acc, clock, clock_rate, delay, delay_rate, rho, rate,
+                 accel, los):  # fmt: skip
+    """Predicted pseudorange, rate and acceleration of every active channel, and unit vectors to the satellites."""
+    pos, vel = np.empty(3), np.empty(3)
+    position_velocity(model, x, pos, vel)
+    cb, cd = clock_columns(model)
+    one_rho, one_rate = np.empty(1), np.empty(1)
+    for c in range(active.size):
+        if not active[c]:
+            continue
+        predict_ranges(sat_pos[c : c + 1], sat_vel[c : c + 1], pos, vel, one_rho, one_rate, los[c : c + 1])
+        v2 = a = 0.0
+        for i in range(3):
+            v2 += (sat_vel[c, i] - vel[i]) ** 2
+            a += los[c, i] * sat_acc[c, i]
+        accel[c] = range_acceleration(los[c], one_rho[0], one_rate[0], v2, a, x[ACC : ACC + 3])
+        rho[c] = one_rho[0] + x[cb] + second[c] * x[ISB] - clock[c] + delay[c]
+        rate[c] = one_rate[0] + x[cd] - clock_rate[c] + delay_rate[c]
+
+
+@njit(cache=True, nogil=True)
+def read_epochs(epochs, counts, slot, active, period_s, sample, fs_hz, rx_frac_s, rx_ms, rho, rate, accel, tables, which,
+                power, fast_s, slow_s, code_m, rate_mps, off_m, off_mps, span_s, seen):  # fmt: skip
+    """Means over each channel's integrations of this epoch: discriminators, and the NCO's offset from the prediction.
+
+    code_m, rate_mps : measured minus NCO;  off_m, off_mps : NCO minus predicted, both at mid-integration
+    ``rx_ms``, ``rx_frac_s``: receiver time at ``sample``; whole code periods of the NCO are those nearest to it.
+    """
+    for c in range(active.size):
+        seen[c] = 0
+        if not active[c]:
+            continue
+        code_m[c] = rate_mps[c] = off_m[c] = off_mps[c] = 0.0
+        k = slot[c]
+        length = period_s[c] * CHIP_RATE_HZ
+        for j in range(counts[k]):
+            e = epochs[k, j]
+            if e.state != STATE_LOCKED:
+                continue
+            T = e.n_samples / fs_hz
+            dt = (np.int64(e.sample_index) - sample) / fs_hz + 0.5 * T
+            phase = e.code_phase_chips + 0.5 * T * CHIP_RATE_HZ * (
+                1.0 + (e.doppler_hz + 0.25 * T * e.doppler_rate_hz_s) / F_L1_HZ
+            )
+            here = rho[c] + dt * (rate[c] + 0.5 * dt * accel[c])
+            t = rx_frac_s + 1e-3 * (rx_ms % 4) + dt - here / C_MPS
+            shift = phase - (t - math.floor(t / period_s[c]) * period_s[c]) * CHIP_RATE_HZ
+            shift -= math.floor(shift / length + 0.5) * length
+            off_m[c] -= shift * METRES_PER_CHIP
+            off_mps[c] += -WAVELENGTH_M * (e.doppler_hz + 0.5 * T * e.doppler_rate_hz_s) - (
+                rate[c] + dt * accel[c]
+            )
+            code_m[c] -= e.code_error_chips * METRES_PER_CHIP
+            rate_mps[c] -= e.freq_error_hz * WAVELENGTH_M
+            p2 = e.prompt_i * e.prompt_i + e.prompt_q * e.prompt_q
+            n2 = e.noise_i * e.noise_i + e.noise_q * e.noise_q
+            watch_power(power[c], p2, n2, T, fast_s, slow_s)
+            span_s[c] = T
+            seen[c] += 1
+        if seen[c] > 0:
+            code_m[c] /= seen[c]
+            rate_mps[c] /= seen[c]
+            off_m[c] /= seen[c]
+            off_mps[c] /= seen[c]
+
+
+@njit(cache=True, nogil=True)
+def weigh(code_m, rate_mps, off_m, off_mps, span_s, seen, cn0, inflate, tables, which, floor_m, floor_mps, z, var, used,
+          gain_code, gain_rate):  # fmt: skip
+    """Innovations, variances and gains of all rows from the discriminators and the fast C/N0."""
+    count = seen.size
+    row = np.empty(4)
+    for c in range(count):
+        used[c] = used[count + c] = seen[c] > 0
+        if seen[c] == 0:
+            continue
+        look_up(tables[which[c]], cn0[c] * span_s[c], row)
+        gain_code[c], gain_rate[c] = row[0], row[2]
+        z[c] = code_m[c] + row[0] * off_m[c]
+        z[count + c] = rate_mps[c] + row[2] * off_mps[c]
+        per_hz = WAVELENGTH_M / (0.5 * span_s[c])
+        var[c] = inflate[c] * row[1] * METRES_PER_CHIP**2 / seen[c] + (row[0] * floor_m) ** 2
+        var[count + c] = inflate[c] * row[3] * per_hz**2 / seen[c] + (row[2] * floor_mps) ** 2
+
+
+@njit(cache=True, nogil=True)
+def steer(active, slot, period_s, sample, rx_ms, rx_frac_s, rho, rate, accel, lead_s, commands):
+    """NCO commands from ``sample`` on: code phase, Doppler and its rate; ``lead_s`` after it the law is exact to
+    second order."""
+    for c in range(active.size):
+        if not active[c]:
+            continue
+        cmd = commands[slot[c]]
+        t = rx_frac_s + 1e-3 * (rx_ms % 4) - rho[c] / C_MPS
+        cmd.sample_index = sample
+        cmd.steered = 1
+        cmd.code_phase_chips = (t - math.floor(t / period_s[c]) * period_s[c]) * CHIP_RATE_HZ
+        cmd.doppler_hz = -rate[c] / WAVELENGTH_M
+        cmd.doppler_rate_hz_s = -accel[c] / WAVELENGTH_M
+
+
+@njit(cache=True, nogil=True)
+def navigation_epoch(model, x, p, sensors, dt_s, filter_s, rates, q_diag, limit, fast_s, slow_s, floor_m, floor_mps,
+                     sample, fs_hz, rx_ms, rx_frac_s, tow_whole, tow_frac, orbit, toe_toc_tgd, active, slot, second,
+                     period_s, delay, delay_rate, inflate, tables, which, epochs, counts, power, cn0, rho, rate, accel,
+                     los, f, phi, qd, h, z, var, used, k, s, p_prior, dx, commands):  # fmt: skip
+    """Predict, update from every channel's discriminators and steer: one call per navigation epoch.
+
+    The epoch ends at receiver ``sample``; commands hold from there on. Returns (NIS, rows, channels seen).
+    """
+    n, count = p.shape[0], active.size
+    sat_pos, sat_vel, sat_acc = np.empty((count, 3)), np.empty((count, 3)), np.empty((count, 3))
+    clock, clock_rate = np.zeros(count), np.zeros(count)
+    tp, tv = np.empty((3, n)), np.empty((3, n))
+    code_m, rate_mps, off_m, off_mps = np.zeros(count), np.zeros(count), np.zeros(count), np.zeros(count)
+    span_s, seen = np.full(count, 0.02), np.zeros(count, np.int64)
+    gain_code, gain_rate = np.ones(count), np.ones(count)
+    predict(model, x, p, sensors, dt_s, filter_s, rates, q_diag, f, phi, qd)
+    satellites_at(
+        orbit, toe_toc_tgd, active, tow_whole, tow_frac, rho, sat_pos, sat_vel, sat_acc, clock, clock_rate
+    )
+    pseudoranges(
+        model,
+        x,
+        active,
+        second,
+        sat_pos,
+        sat_vel,
+        sat_acc,
+        clock,
+        clock_rate,
+        delay,
+        delay_rate,
+        rho,
+        rate,
+        accel,
+        los,
+    )
+    read_epochs(
+        epochs, counts, slot, active, period_s, sample, fs_hz, rx_frac_s, rx_ms, rho, rate, accel, tables, which, power,
+        fast_s, slow_s, code_m, rate_mps, off_m, off_mps, span_s, seen,
+    )  # fmt: skip
+    cn0_from_powers(power, active, span_s, cn0)
+    h[:] = 0.0
+    z[:] = 0.0
+    var[:] = 1.0
+    used[:] = False
+    weigh(
+        code_m, rate_mps, off_m, off_mps, span_s, seen, cn0, inflate, tables, which, floor_m, floor_mps, z, var, used,
+        gain_code, gain_rate,
+    )  # fmt: skip
+    rows(model, x, n, los, second, gain_code, gain_rate, tp, tv, h)
+    nis, n_rows = filter_update(model, x, p, h, z, var, used, power, limit, k, s, p_prior, dx)
+    pseudoranges(
+        model,
+        x,
+        active,
+        second,
+        sat_pos,
+        sat_vel,
+        sat_acc,
+        clock,
+        clock_rate,
+        delay,
+        delay_rate,
+        rho,
+        rate,
+        accel,
+        los,
+    )
+    steer(active, slot, period_s, sample, rx_ms, rx_frac_s, rho, rate, accel, 0.0, commands)
+    tracked = 0
+    for c in range(count):
+        tracked += seen[c] > 0
+    return nis, n_rows, tracked
+
+
+@njit(cache=True, nogil=True)
+def predicted_sigma(model, x, p, los, active, out):
+    """Largest standard deviations of predicted range (m) and rate (m/s) over the active channels into ``out`` (2,)."""
+    n = p.shape[0]
+    tp, tv = np.empty((3, n)), np.empty((3, n))
+    maps(model, x, tp, tv)
+    ib, idr = clock_states(model)
+    row = np.empty(n)
+    out[:] = 0.0
+    for c in range(active.size):
+        if not active[c]:
+            continue
+        for kind in range(2):
+            t = tp if kind == 0 else tv
+            for j in range(n):
+                row[j] = -(los[c, 0] * t[0, j] + los[c, 1] * t[1, j] + los[c, 2] * t[2, j])
+            row[ib if kind == 0 else idr] += 1.0
+            v = 0.0
+            for i in range(n):
+                for j in range(n):
+                    v += row[i] * p[i, j] * row[j]
+            out[kind] = max(out[kind], math.sqrt(max(v, 0.0)))
+
+
+@njit(cache=True, nogil=True)
+def horizontal_sigma(model, x, p):
+    """Standard deviation of the horizontal position (m), root of the sum of both axes' variances."""
+    n = p.shape[0]
+    tp, tv = np.empty((3, n)), np.empty((3, n))
+    maps(model, x, tp, tv)
+    pos, vel = np.empty(3), np.empty(3)
+    position_velocity(model, x, pos, vel)
+    up = pos / math.sqrt(pos[0] ** 2 + pos[1] ** 2 + pos[2] ** 2)
+    total = vertical = 0.0
+    for i in range(n):
+        for j in range(n):
+            if p[i, j] == 0.0:
+                continue
+            ui = up[0] * tp[0, i] + up[1] * tp[1, i] + up[2] * tp[2, i]
+            uj = up[0] * tp[0, j] + up[1] * tp[1, j] + up[2] * tp[2, j]
+            total += (tp[0, i] * tp[0, j] + tp[1, i] * tp[1, j] + tp[2, i] * tp[2, j]) * p[i, j]
+            vertical += ui * uj * p[i, j]
+    return math.sqrt(max(total - vertical, 0.0))
