@@ -381,15 +381,29 @@ def _quiet_corr(campaign: Campaign, group: int, root: int, trial: int, n_epochs:
     return sum_dumps(twin(n_epochs)[1], spec.dumps)
 
 
+@lru_cache(maxsize=1)
+def _blas() -> Any:
+    import scipy.linalg  # noqa: F401  (brings a BLAS of its own, which must be loaded to be limited)
+    from threadpoolctl import ThreadpoolController
+
+    return ThreadpoolController()
+
+
+def _one_thread() -> Any:
+    """Products by one BLAS thread: how they are cut up among several would show in the last bit."""
+    return _blas().limit(limits=1, user_api="blas")
+
+
 def quiet_statistics(text: str, group: int, first: int, count: int) -> list[list[np.ndarray]]:
     """Values of every monitor on trials of the threshold set: one list of arrays per trial."""
     campaign = _campaign(text)
     spec = campaign.spec
-    runs = _trained(text, group)
     out = []
-    for trial in range(first, first + count):
-        corr = _quiet_corr(campaign, group, spec.seeds.threshold, trial, spec.threshold.epochs)
-        out.append([run.fresh()(corr)["value"].astype(np.float32) for run in runs.values()])
+    with _one_thread():
+        runs = _trained(text, group)
+        for trial in range(first, first + count):
+            corr = _quiet_corr(campaign, group, spec.seeds.threshold, trial, spec.threshold.epochs)
+            out.append([run.fresh()(corr)["value"].astype(np.float32) for run in runs.values()])
     return out
 
 
@@ -446,10 +460,17 @@ def evaluate_trials(
 ) -> np.ndarray:
     """TRIAL rows (count x monitors) of the evaluation set; a pure function of its arguments."""
     campaign = _campaign(text)
-    runs = _trained(text, campaign.group[point])
     one = _open_trial if campaign.spec.loop == "open" else _closed_trial
-    parts = [one(campaign, runs, point, trial, thresholds) for trial in range(first, first + count)]
+    with _one_thread():
+        runs = _trained(text, campaign.group[point])
+        parts = [one(campaign, runs, point, trial, thresholds) for trial in range(first, first + count)]
     return np.concatenate(parts)
+
+
+def warm_up(text: str, point: int) -> None:
+    """Train what a point needs, in this process."""
+    with _one_thread():
+        _trained(text, _campaign(text).group[point])
 
 
 class _World:

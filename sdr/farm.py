@@ -33,6 +33,7 @@ from sdr.campaign import (
     load,
     quiet_statistics,
     summarise,
+    warm_up,
 )
 from sdr.jobs import _progress
 
@@ -327,7 +328,7 @@ class _Local:
     def _start(self) -> None:
         import multiprocessing as mp
 
-        # One BLAS thread each: more would quarrel over the cores, and could change the last bit.
+        # One BLAS thread each: more would quarrel over the cores.
         for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
             os.environ.setdefault(name, "1")
         method = "forkserver" if "forkserver" in mp.get_all_start_methods() else "spawn"
@@ -400,7 +401,10 @@ class _Cluster:
             ) from None
         import logging
 
-        logging.getLogger("distributed").setLevel(logging.CRITICAL)
+        # A lost connection is told in one sentence below, not in their traces.
+        for name in ("distributed", "distributed.client", "distributed.core", "distributed.comm", "tornado"):
+            logging.getLogger(name).setLevel(logging.CRITICAL)
+        logging.getLogger("tornado.application").setLevel(logging.CRITICAL)
         self.address, self._path = address, path
         self._threads, self._counted_at = 1, -math.inf
         try:
@@ -588,9 +592,7 @@ class _Planner:
 def _timed_trials(
     text: str, point: int, first: int, count: int, limits: tuple[float, ...]
 ) -> tuple[np.ndarray, float]:
-    from sdr.campaign import _campaign, _trained
-
-    _trained(text, _campaign(text).group[point])
+    warm_up(text, point)
     begin = time.perf_counter()
     rows = evaluate_trials(text, point, first, count, limits)
     return rows, time.perf_counter() - begin

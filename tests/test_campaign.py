@@ -404,7 +404,8 @@ def test_a_cluster_gives_the_same_though_a_worker_is_killed(reference, cluster, 
             processes[1].send_signal(signal.SIGKILL)
             killed = True
         time.sleep(0.005)
-    assert killed and p.returncode == 0
+    assert p.returncode == 0, p.stderr.read().decode()
+    assert killed
     assert same(contents(out), expected)
 
 
