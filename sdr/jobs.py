@@ -201,6 +201,8 @@ def _receive(spec: ReceiverSpec, source: Any, store: Store, label: str, quiet: b
 
 def _store_outcome(store: Store, receiver: Receiver, outcome: Outcome, tally: _Tally) -> None:
     store.append("acquisition", outcome.found)
+    if receiver.mitigation:
+        store.append("mitigation/tones", receiver.mitigation.tones())
     for row in outcome.found:
         tally.locked_s.setdefault((row["signal"].decode(), int(row["prn"])), 0.0)
     channels = receiver.tracker.channels

@@ -60,7 +60,8 @@ class Receiver:
 
     def __init__(self, spec: ReceiverSpec, source: Source) -> None:
         self.spec = spec
-        self.source = source
+        self.mitigation = spec.mitigation.start(source) if spec.mitigation else None
+        self.source = self.mitigation or source
         self.fs_hz = float(source.fs_hz)
         self.tracker = spec.tracking.start(source.fs_hz, source.if_hz)
         self.telemetry = Telemetry(self.tracker)
@@ -94,19 +95,15 @@ class Receiver:
 
     def _advance(self, n0: int, iq: np.ndarray, navigate: bool) -> Outcome:
         n_end = n0 + iq.shape[1]
+        # Searching comes first: a new channel starts with this slab, so that nothing of a short file is lost.
+        found = self._search(n0, iq)
         epochs, counts, corr = self.tracker.process(n0, iq)
         self.telemetry.update()
         self.position = n_end
-        out = Outcome(
-            n0,
-            n_end,
-            np.empty(0, ACQUISITION),
-            [(c, epochs[c, :n], corr[c, :n]) for c, n in enumerate(counts) if n],
-        )
+        rows = [(c, epochs[c, :n], corr[c, :n]) for c, n in enumerate(counts) if n]
+        out = Outcome(n0, n_end, found, rows)
         if navigate:
             self._navigate(n_end, out)
-        # Searching comes last: a new channel starts at the next slab's first sample.
-        out.found = self._search(n0, iq)
         return out
 
     # -- acquisition ------------------------------------------------------------------------------------------------

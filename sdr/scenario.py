@@ -24,6 +24,7 @@ from signals.source import SyntheticSource
 from signals.trajectory import MotionSpec, Static
 from tracking.acquisition import AcquisitionSpec
 from tracking.channel import TrackingSpec
+from tracking.mitigation import MitigationSpec
 
 T = TypeVar("T", bound=BaseModel)
 SCHEMA = 1
@@ -38,6 +39,7 @@ class ReceiverSpec(BaseModel):
     acquisition: AcquisitionSpec = AcquisitionSpec()
     tracking: TrackingSpec = TrackingSpec()
     navigation: NavigationSpec = NavigationSpec()
+    mitigation: MitigationSpec | None = None
     slab_ms: Annotated[int, Field(ge=20, le=1000, multiple_of=20)] = 200
     """Longest slab of samples that passes through the loop at once; the results hardly depend on it."""
     search_every_s: Annotated[float, Field(gt=0)] = 5.0

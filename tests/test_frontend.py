@@ -1,5 +1,6 @@
 """Front end: every stage against its definition, the same bits for any chunks, quantiser losses and capture."""
 
+import itertools
 import math
 
 import numpy as np
@@ -25,10 +26,7 @@ def run(iq, cuts=(), rms=1.0, **spec):
     """All samples through a front end, in pieces."""
     front_end = FrontEndSpec(fs_hz=FS_HZ, **spec).start(rms, seed=5)
     edges = [0, *cuts, iq.shape[1]]
-    parts = [
-        front_end.push(iq[:, a:b].copy(), last=b == iq.shape[1])
-        for a, b in zip(edges[:-1], edges[1:], strict=True)
-    ]
+    parts = [front_end.push(iq[:, a:b].copy(), last=b == iq.shape[1]) for a, b in itertools.pairwise(edges)]
     return np.concatenate(parts, axis=1)
 
 
