@@ -228,8 +228,17 @@ class Receiver:
                 row[name] = float(replica[name][c]) if alive else None
             row["ephemeris"] = self.telemetry.has_ephemeris(signal, prn)
             row["healthy"] = self.telemetry.healthy(signal, prn)
+            if signal == "E1C":
+                row |= self._pilot(c, prn)
             rows.append(row)
         return rows
+
+
+    def _pilot(self, c: int | None, prn: int) -> dict[str, Any]:
+        """What Galileo's pilot showed: CS25_1 aligned, and I/NAV sync patterns on E1-B by sign."""
+        upright, inverted = self.telemetry.sync_patterns("E1C", prn)
+        aligned = c is not None and bool(self.tracker.channels["state"][c] == STATE_LOCKED)
+        return {"secondary_code": aligned, "sync_patterns": {"upright": upright, "inverted": inverted}}
 
 
 def _ranges(prns: list[int]) -> str:

@@ -19,6 +19,11 @@ def test_receive_tracks_all_and_says_why_there_is_no_fix(tmp_path):
     )
     tracked = {(s["signal"], s["prn"]) for s in result["satellites"] if s["locked_s"] > 0.1}
     assert {("L1CA", p) for p in GPS} | {("E1C", p) for p in GALILEO} <= tracked
+    for s in result["satellites"]:
+        if s["signal"] == "E1C" and s["prn"] in GALILEO:
+            # Upright once the pilot's sign is taken out: the composite's minus sign on E1-C.
+            assert s["secondary_code"]
+            assert s["sync_patterns"]["upright"] >= 1
     assert result["fix"] is None
     assert "0.5 s" in result["no_fix_reason"]
 

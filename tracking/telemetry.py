@@ -32,6 +32,8 @@ class Telemetry:
         self._base = {}  # channel -> symbol index of its code period 0
         self._end = {}  # satellite -> next symbol index
         self._slips = {}  # satellite -> slips at the last call of slipped
+        self._tail = {}  # Galileo satellite -> last nine symbol signs, while its pages are not synchronised
+        self._matches = {}  # Galileo satellite -> [upright, inverted] sync patterns seen meanwhile
 
     def start(self, c):
         """Channel ``c`` was given to a satellite (again): its code periods count from zero."""
@@ -54,9 +56,26 @@ class Telemetry:
             decoder, key = self.decoders[self._satellite(c)], self._satellite(c)
             # A bit that was cut off leaves a hole in the count: feed the runs between holes.
             for run in np.split(np.arange(len(index)), np.flatnonzero(np.diff(index) != 1) + 1):
-                events += [(c, e) for e in decoder.feed(sign * rows["soft"][run], int(index[run[0]]))]
+                symbols = sign * rows["soft"][run]
+                events += [(c, e) for e in decoder.feed(symbols, int(index[run[0]]))]
+                if key[0] == "E" and not decoder.synced:
+                    self._look_for_sync(key, symbols)
             self._end[key] = int(index[-1]) + 1
         return events
+
+    def _look_for_sync(self, key, symbols):
+        """Count exact sync patterns of either sign (by chance, 2 in 1024 places) until a page confirms one."""
+        signs = np.concatenate([self._tail.get(key, np.zeros(0)), np.sign(symbols)])
+        score = np.correlate(signs, inav.SYNC_SIGNS, "valid") if len(signs) >= 10 else np.zeros(0)
+        matches = self._matches.setdefault(key, [0, 0])
+        matches[0] += int(np.sum(score > 9.5))
+        matches[1] += int(np.sum(score < -9.5))
+        self._tail[key] = signs[-9:]
+
+    def sync_patterns(self, signal, prn):
+        """(upright, inverted) I/NAV sync patterns seen before page synchronisation; None for GPS."""
+        key = _system(signal), int(prn)
+        return tuple(self._matches.get(key, (0, 0))) if key[0] == "E" else None
 
     def reference(self, c):
         """(code period, transmit time of week at its start in ms) of channel ``c``; (0, -1) while not
