@@ -18,11 +18,12 @@ def periods(epoch, length, fs_hz):
 
 
 def replica(table, taps_q, n, phase, rate):
-    """Rows of the code table for one code period as the kernel's contract says: (taps, n) int, blocks <= 1024."""
+    """Rows of the code table for one code period as the kernel's contract says: (taps, n) int, blocks <= 1024 (704)."""
     per_chip, n_phase = table.samples_per_chip, len(table.table)
     wrap = round(table.code_length_chips * per_chip * n_phase)
-    pairs = 2 * math.ceil(n / 2048)
-    block = min(1024, math.ceil(math.ceil(n / pairs) / 32) * 32)
+    longest = 1024 if table.scale == 1.0 else 704
+    blocks = 2 * math.ceil(n / (2 * longest))
+    block = min(longest, math.ceil(math.ceil(n / blocks) / 32) * 32)
     out = np.zeros((len(taps_q), n))
     for a in range(0, n, block):
         nb = min(block, n - a)
@@ -49,4 +50,18 @@ def correlate(epoch, iq, table, taps_q, fs_hz, if_hz, signs=None):
             epoch, start, n, fs_hz, if_hz
         )
         total += (1.0 if signs is None else signs[k]) * (replica(table, taps_q, n, phase, rate) @ z)
+    return total / int(epoch["n_samples"])
+
+
+def rounding_chips(epoch, table, fs_hz):
+    """Mean over the integration of (phase the table was read at - nominal phase), chips."""
+    per_chip, n_phase = table.samples_per_chip, len(table.table)
+    total = 0.0
+    for _, n, phase, rate in periods(epoch, table.code_length_chips, fs_hz):
+        block = min(1024, math.ceil(math.ceil(n / (2 * math.ceil(n / 2048))) / 32) * 32)
+        for a in range(0, n, block):
+            nb = min(block, n - a)
+            for_sample = np.arange(nb)
+            first = math.floor(((phase + (a + nb / 2) * rate) * per_chip - nb / 2) * n_phase + 0.5) / n_phase
+            total += np.sum((first + for_sample) / per_chip - (phase + (a + for_sample) * rate))
     return total / int(epoch["n_samples"])

@@ -9,13 +9,13 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 
 from signals.codes import secondary_code
 from signals.constants import CHIP_RATE_HZ, F_L1_HZ
-from signals.modulation import SIGNALS, autocorrelation, chip_acf, code_table
+from signals.modulation import BLOCK, SIGNALS, autocorrelation, chip_acf, code_table
 from tracking.discriminators import CARRIER_DISCRIMINATORS, CODE_DISCRIMINATORS, code_scale_chips
 from tracking.kernels import CHANNEL, HISTORY, KIND_CA, KIND_DATA, KIND_PILOT, SYMBOL, track_slab
 from tracking.lock import STATE_BIT_SYNC, STATE_IDLE, STATE_LOCKED, STATE_LOST, STATE_PULL_IN
 from tracking.loops import MAX_BT, dll_gains, fll_gain, pll_gains
 from tracking.records import AIDING, EPOCH, REPLICA
-from tracking.vector_ir import HAS_INTEGER_PATH
+from tracking.vector_ir import HAS_INTEGER_PATH, LONGEST_MULTILEVEL
 
 __all__ = [
     "STATE_BIT_SYNC",
@@ -32,7 +32,7 @@ __all__ = [
 
 _FROZEN = ConfigDict(frozen=True, extra="forbid")
 _BOC61_FITS_HZ = 15e6  # below it the BOC(6,1) part of CBOC is not in the samples (signals.modulation)
-_MAX_TABLE_RATE_HZ = 300e6  # rows per sample x fs: bounds a table's size at high rates
+_MAX_TABLE_RATE_HZ = 330e6  # rows per sample x fs: bounds a table's size at high rates
 
 
 def _text(signal):
@@ -299,6 +299,7 @@ class Tracker:
             data_waveform = "BOC11" if waveform == "BOC11" else SIGNALS["E1B"].waveform
             st["data_table_start"], st["data_scale"] = self._table("E1B", prn, data_waveform)[:2]
         st["table_columns"], st["n_phase"], st["phase_shift"] = columns, n_phase, n_phase.bit_length() - 1
+        st["longest_block"] = BLOCK if st["scale"] == 1.0 else LONGEST_MULTILEVEL
         exact = SIGNALS[signal].code_length_chips * float(st["samples_per_chip"]) * n_phase
         st["wrap_q"] = round(exact)
         st["wrap_error_q"] = round(exact) - exact

@@ -82,6 +82,7 @@ CHANNEL = np.dtype(
         ("table_start", "i8"),
         ("data_table_start", "i8"),
         ("table_columns", "i8"),
+        ("longest_block", "i8"),
         ("scale", "f8"),
         ("data_scale", "f8"),
         ("n_taps", "i4"),
@@ -414,8 +415,9 @@ def _correlate_period(
         ci.ctypes.data, si.ctypes.data, pool.ctypes.data, starts.ctypes.data, whole.ctypes.data,
     )  # fmt: skip
     u, v = wi.ctypes.data, wq.ctypes.data
-    blocks = 2 * ((n + 2 * _BLOCK - 1) // (2 * _BLOCK))
-    block = min(_BLOCK, ((n + blocks - 1) // blocks + 31) // 32 * 32)
+    longest = st.longest_block
+    blocks = 2 * ((n + 2 * longest - 1) // (2 * longest))
+    block = min(longest, ((n + blocks - 1) // blocks + 31) // 32 * 32)
     n_blocks = (n + block - 1) // block
     for k in range(2 * n_sums + 2):
         sums[k] = 0.0

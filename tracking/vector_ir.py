@@ -4,7 +4,8 @@ numba does not find the multiply-add of 16-bit pairs (vpmaddwd, with VNNI vpdpws
 these loops are written as LLVM IR, 16 samples at a time. Arithmetic, exact in integers:
 
     u = round(2^7 (x c + y s)), v = round(2^7 (y c - x s)),  c, s in units of 2^-14, each product rounded on its own;
-    sums of u p and v p in 32 bits: 1024 samples of at most 2^7 127 sqrt(2) times a code level of at most 127 fit.
+    sums of u p and v p in 32 bits: 1024 samples of at most 2^7 128 sqrt(2) times +-1 fit with room, and
+    ``LONGEST_MULTILEVEL`` samples times code levels of at most 127.
 
 Where AVX2 is absent, ``HAS_INTEGER_PATH`` is false and ``kernels`` uses its single-precision loops, which agree to
 about -90 dB.
@@ -34,6 +35,8 @@ TABLE_ONE = 16384.0
 """One, in the units of the integer carrier table."""
 INTEGER_SCALE = 128.0
 """One unit of sample x code, in the sums."""
+LONGEST_MULTILEVEL = 704
+"""Most samples of a block where code levels go up to 127: 704 x 2^7 128 sqrt(2) x 127 < 2^31."""
 WIDTH = 16
 """Samples per step; the caller treats the remainder."""
 
