@@ -94,7 +94,9 @@ def simulate(
     files = [str(p) for p in writer.files] + [str(truth_path)]
     duration_s = source.n_samples / source.fs_hz
     satellites = [
-        {"signal": s.signal, "prn": s.prn, "cn0_dbhz": float(s.cn0_dbhz)} for s in source.sky.satellites
+        {"signal": s.signal, "prn": s.prn, "cn0_dbhz": float(s.cn0_dbhz)}
+        for s in source.sky.satellites
+        if not s.name.endswith("-spoofed")
     ]
     text_out = f"{duration_s:g} s, {source.n_samples} samples, {len(satellites)} satellites, {duration_s / elapsed:.1f} times real time\n"
     return {
@@ -246,6 +248,7 @@ class _Truth:
             self._store.append("truth/receiver", self._source.pvt_truth(ready))
             self._store.append("truth/jammers", self._source.jammer_truth(ready))
             self._store.append("truth/echoes", self._source.echo_truth(ready))
+            self._store.append("truth/faults", self._source.fault_truth(ready))
             self._index = self._index[len(ready) :]
 
 

@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from nav.navigator import NavigationSpec
 from signals.clock import ClockSpec
+from signals.faults import FaultSpec, faulty
 from signals.frontend import FrontEndSpec
 from signals.jammers import JammerRun, JammerSpec
 from signals.multipath import EchoRun, MultipathSpec
@@ -64,6 +65,7 @@ class Scenario(BaseModel):
     front_end: FrontEndSpec = FrontEndSpec()
     jammer: tuple[JammerSpec, ...] = ()
     multipath: MultipathSpec | None = None
+    fault: tuple[FaultSpec, ...] = ()
     receiver: ReceiverSpec = ReceiverSpec()
 
 
@@ -77,7 +79,7 @@ def source(spec: Scenario, threads: int = 1) -> SyntheticSource:
     clock = spec.clock.start(_child(spec, CLOCK), spec.duration_s, motion)
     sky = spec.sky.start(motion, clock, spec.duration_s, _child(spec, SKY))
     return SyntheticSource(
-        sky, spec.front_end, spec.duration_s, _child(spec, NOISE),
+        faulty(sky, spec.fault, spec.duration_s), spec.front_end, spec.duration_s, _child(spec, NOISE),
         jammers=jammers(spec, spec.front_end.fs_hz, spec.front_end.if_hz, spec.front_end.complex, sky),
         echoes=echoes(spec, [s.name for s in sky.satellites]), threads=threads,
     )  # fmt: skip

@@ -129,6 +129,22 @@ ECHO_TRUTH = np.dtype(
 )
 """Truth of one echo at one sample."""
 
+FAULT_TRUTH = np.dtype(
+    [
+        ("sample_index", "u8"),
+        ("t_s", "f8"),
+        ("fault", "i4"),  # place in the scenario's list
+        ("kind", "S12"),
+        ("system", "S1"),  # empty: all satellites
+        ("prn", "i4"),
+        ("on", "?"),
+        ("code_m", "f8"),  # added to the range that the code shows (a spoofer: its range minus the genuine one)
+        ("carrier_m", "f8"),
+        ("level_db", "f8"),  # added to the satellite's C/N0 (a spoofer: its power over the genuine one)
+    ]
+)
+"""Truth of one fault at one sample."""
+
 CODE_LINE = np.dtype(
     [
         ("signal", "S4"),

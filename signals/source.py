@@ -16,7 +16,7 @@ from signals.kernels import COMPONENT, synthesise, synthesise_int8
 from signals.lnav import encode as encode_lnav
 from signals.modulation import BLOCK, code_table
 from signals.multipath import EchoRun
-from signals.records import ECHO_TRUTH, EPHEMERIS, JAMMER_TRUTH, TRUTH
+from signals.records import ECHO_TRUTH, EPHEMERIS, FAULT_TRUTH, JAMMER_TRUTH, TRUTH
 from signals.sky import Propagation, Satellite, Sky
 
 __all__ = ["CELLS_PER_S", "SyntheticSource", "amplitude", "hermite_cells", "truth"]
@@ -167,6 +167,11 @@ class SyntheticSource:
                     part["power_db"] = 20 * np.log10(np.abs(gain[:, 0]))
                 rows.append(part)
         return np.concatenate(rows)
+
+    def fault_truth(self, sample_index) -> np.ndarray:
+        """FAULT_TRUTH rows at these samples, by sample, then fault."""
+        faults = getattr(self.sky, "fault_truth", None)
+        return np.zeros(0, FAULT_TRUTH) if faults is None else faults(sample_index, self.fs_hz)
 
     def truth_index(self, rate_hz: float = 10.0) -> np.ndarray:
         """Samples at which truth is written: every 1 / rate_hz from the first, uint64."""
@@ -353,7 +358,7 @@ def _messages(sky: Sky, satellite: Satellite, start_s: int):
 
 
 def truth(sky: Sky, sample_index, fs_hz: float) -> np.ndarray:
-    """TRUTH rows of the visible satellites at these samples, by sample, then satellite."""
+    """TRUTH rows of the visible, genuine satellites at these samples, by sample, then satellite."""
     index = np.atleast_1d(np.asarray(sample_index, np.uint64))
     t = index / fs_hz
     now = sky.propagate(t)
@@ -378,7 +383,9 @@ def truth(sky: Sky, sample_index, fs_hz: float) -> np.ndarray:
     }
     for name, values in columns.items():
         out[name] = values.T
-    return out[now.visible.T]
+    real = now.visible.T.copy()
+    real[:, getattr(sky, "genuine", len(sky.satellites)) :] = False
+    return out[real]
 
 
 def _code_phase(now: Propagation, row: int, index: np.ndarray, fs_hz: float, length: int) -> np.ndarray:
