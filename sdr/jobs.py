@@ -11,6 +11,7 @@ import numpy as np
 from sdr import iffile, scenario
 from sdr.receiver import Outcome, Receiver
 from sdr.scenario import ReceiverSpec, Scenario
+from sdr.spectrum import EVERY_S, Watched
 from sdr.store import Store
 from signals.geodesy import ecef_to_geodetic
 from signals.modulation import SIGNALS
@@ -174,7 +175,8 @@ class _Tally:
 
 
 def _receive(spec: ReceiverSpec, source: Any, store: Store, label: str, quiet: bool) -> dict[str, Any]:
-    receiver = Receiver(spec, source)
+    watched = Watched(source)
+    receiver = Receiver(spec, watched)
     truth = _Truth(source, store)
     tally = _Tally()
     begin = time.perf_counter()
@@ -182,6 +184,7 @@ def _receive(spec: ReceiverSpec, source: Any, store: Store, label: str, quiet: b
         with _progress(label, source.n_samples, quiet) as advance:
             for outcome in receiver:
                 _store_outcome(store, receiver, outcome, tally)
+                store.append("samples/spectrum", watched.rows(), fs_hz=source.fs_hz, if_hz=source.if_hz, every_s=EVERY_S)
                 truth.up_to(outcome.n_end)
                 if store.due():
                     store.checkpoint()
@@ -189,11 +192,13 @@ def _receive(spec: ReceiverSpec, source: Any, store: Store, label: str, quiet: b
     finally:
         truth.up_to(receiver.position, last=True)
         _store_theory(store, receiver)
+        _store_alarms(store, receiver)
     duration_s = receiver.position / receiver.fs_hz
     result: dict[str, Any] = {
         "duration_s": duration_s,
         "real_time_factor": duration_s / (time.perf_counter() - begin),
         "satellites": receiver.satellites(tally.locked_s),
+        "monitors": _monitors(receiver),
     }
     result["fix"], result["no_fix_reason"] = _fix(receiver, source, tally), None
     if result["fix"] is None:
@@ -214,24 +219,34 @@ def _store_outcome(store: Store, receiver: Receiver, outcome: Outcome, tally: _T
         store.append(f"{name}/epochs", epochs, signal=signal, prn=prn, fs_hz=receiver.fs_hz)
         taps = receiver.tracker.taps_chips(c)
         store.append(
-            f"{name}/corr", corr[:, : len(taps)], taps_chips=taps, waveform=_replica(receiver, signal)
+            f"{name}/corr", corr[:, : len(taps)], taps_chips=taps, waveform=receiver.waveform(signal), **_roles(channels[c])
         )
         locked = epochs["state"] == STATE_LOCKED
         tally.locked_s[signal, prn] += float(epochs["n_samples"][locked].sum()) / receiver.fs_hz
+    for name, rows in outcome.statistics:
+        store.append(f"monitors/{name}", rows)
     for rows in outcome.observations:
         store.append("navigation/observations", rows)
+    for rows in outcome.views:
+        store.append("navigation/satellites", rows)
     for row in outcome.solutions:
-        store.append("navigation/solution", row, fs_hz=receiver.fs_hz)
+        store.append("navigation/solution", row, fs_hz=receiver.fs_hz, **_leap(receiver))
         if row["valid"][0]:
             tally.fixes.append(row)
             tally.used.update(dict.fromkeys(receiver.navigator.used))
 
 
-def _replica(receiver: Receiver, signal: str) -> str:
-    if signal == "L1CA":
-        return "BPSK"
-    boc = receiver.spec.tracking.e1.replica == "BOC11"
-    return "BOC11" if boc else SIGNALS[signal].waveform
+def _leap(receiver: Receiver) -> dict[str, int]:
+    """GPS minus UTC, as far as a message said it."""
+    rows = [receiver.telemetry.iono_utc(system) for system in ("G", "E")]
+    said = [int(row["dt_ls_s"]) for row in rows if row is not None and row["dt_ls_s"]]
+    return {"leap_s": said[0]} if said else {}
+
+
+def _roles(channel: np.void) -> dict[str, int]:
+    """Which taps are early, prompt and late; very early and very late only where there are such."""
+    roles = {r: int(channel[r]) for r in ("early", "prompt", "late", "very_early", "very_late")}
+    return {f"{r}_tap": k for r, k in roles.items() if k >= 0}
 
 
 class _Truth:
@@ -266,6 +281,30 @@ def _store_theory(store: Store, receiver: Receiver) -> None:
             phase_sigma_cycles=pll_jitter_cycles(cn0, loops.pll_bw_hz, t_s),
             code_sigma_m=293.05 * dll_jitter_chips(cn0, loops.dll_bw_hz, t_s, loops.early_late_space_chips),
         )
+
+
+def _store_alarms(store: Store, receiver: Receiver) -> None:
+    """What waits in the monitors, their thresholds and their alarms."""
+    for monitor in receiver.monitors:
+        for rows in monitor.flush():
+            store.append(f"monitors/{monitor.spec.name}", rows)
+        store.append("monitors/thresholds", monitor.watched())
+        for rows in monitor.alarms().values():
+            store.append("monitors/alarms", rows)
+
+
+def _monitors(receiver: Receiver) -> list[dict[str, Any]]:
+    """One row per monitor and channel: threshold, number of tests, alarms."""
+    out = []
+    for monitor in receiver.monitors:
+        alarms = monitor.alarms()
+        for row in monitor.watched():
+            key = row["signal"].decode(), int(row["prn"])
+            numbers = {k: float(row[k]) for k in ("threshold", "p_fa", "trained_s")}
+            found = [{k: float(a[k]) for k in ("start_s", "end_s", "peak")} for a in alarms[key]]
+            head = {"name": monitor.spec.name, "signal": key[0], "prn": key[1]}
+            out.append(head | numbers | {"tests": int(row["tests"]), "alarms": found})
+    return out
 
 
 def _fix(receiver: Receiver, source: Any, tally: _Tally) -> dict[str, Any] | None:
@@ -338,6 +377,9 @@ def _summary(result: dict[str, Any]) -> str:
             f"position {fix['lat_deg']:.7f} deg, {fix['lon_deg']:.7f} deg, {fix['height_m']:.2f} m: {fix['epochs']} fixes "
             f"from {fix['first_s']:.1f} s on with {len(fix['used'])} satellites{error}"
         )
+    for m in result["monitors"]:
+        first = f", the first at {m['alarms'][0]['start_s']:.1f} s" if m["alarms"] else ""
+        rows.append(f"{m['name']} on {m['signal']} {m['prn']}: {len(m['alarms'])} alarms in {m['tests']} tests{first}")
     rows.append(f"results in {result['output']}")
     rows += [f"  {p}" for p in result.get("figures", [])]
     return "\n".join(rows)

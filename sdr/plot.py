@@ -41,7 +41,17 @@ def plot(results: Path, directory: Path | None = None) -> list[Path]:
         directory.mkdir(parents=True, exist_ok=True)
         channels = _channels(h5)
         drawn = []
-        for draw in (_tracking_errors, _cn0, _iq, _correlation, _sky, _position):
+        for draw in (
+            _tracking_errors,
+            _cn0,
+            _iq,
+            _correlation,
+            _sky,
+            _position,
+            _spectrum,
+            _attack,
+            _attacked_peak,
+        ):
             path = draw(h5, channels, directory)
             if path is not None:
                 drawn.append(path)
@@ -227,4 +237,114 @@ def _position(h5: h5py.File, channels: dict[str, h5py.Group], directory: Path) -
         ax_n.plot(solution["t_s"], solution["pdop"], label="PDOP")
         ax_n.set_xlabel("time (s)")
         ax_n.legend(fontsize=8)
+    return path
+
+
+def _attacks(h5: h5py.File) -> list[tuple[float, float]]:
+    """Times (begin, end) in s during which any jammer is on."""
+    if "truth/jammers" not in h5:
+        return []
+    rows = h5["truth/jammers"][:]
+    t_s, k = np.unique(rows["t_s"], return_inverse=True)
+    on = np.bincount(k, rows["on"]) > 0
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], on.astype(int), [0]])))
+    return [
+        (float(t_s[a]), float(t_s[min(b, len(t_s) - 1)]))
+        for a, b in zip(edges[::2], edges[1::2], strict=True)
+    ]
+
+
+def _spectrum(h5: h5py.File, channels: dict[str, h5py.Group], directory: Path) -> Path | None:
+    """Waterfall of what was received, and its mean with and without attack."""
+    if "samples/spectrum" not in h5 or len(h5["samples/spectrum"]) < 2:
+        return None
+    data = h5["samples/spectrum"]
+    rows, attrs = data[:], data.attrs
+    freq_mhz = ((np.arange(rows.shape[1]) / rows.shape[1] - 0.5) * attrs["fs_hz"] - attrs["if_hz"]) * 1e-6
+    t_s = np.arange(len(rows)) * attrs["every_s"]
+    on = np.any([(t_s >= a) & (t_s < b) for a, b in _attacks(h5)] or [np.zeros(len(t_s), bool)], axis=0)
+    path = directory / "spectrum.png"
+    with figure(path, "Spectrum of the samples", rows=2, size=(9, 8)) as (ax, fall):
+        for mask, label in ((~on, "without jammer"), (on, "with jammer")):
+            if mask.any():
+                ax.plot(
+                    freq_mhz, 10 * np.log10(np.mean(10 ** (rows[mask] / 10), axis=0)), lw=0.9, label=label
+                )
+        ax.set_ylabel("power per bin (dB re ADC level²)")
+        ax.legend(fontsize=8)
+        low, high = np.quantile(rows, [0.02, 0.999])
+        image = fall.pcolormesh(freq_mhz, t_s, rows, vmin=low, vmax=high, shading="nearest", rasterized=True)
+        fall.figure.colorbar(image, ax=[ax, fall], label="dB", shrink=0.5)
+        fall.set(xlabel="offset from the carrier (MHz)", ylabel="time (s)")
+    return path
+
+
+def _attack(h5: h5py.File, channels: dict[str, h5py.Group], directory: Path) -> Path | None:
+    """C/N0, code and carrier errors, the attack shaded."""
+    spans = _attacks(h5)
+    if not spans or not channels:
+        return None
+    path = directory / "attack.png"
+    with figure(path, "Under attack (shaded)", rows=3, size=(9, 8)) as axes:
+        for k, group in enumerate(channels.values()):
+            e, color = group["epochs"][:], f"C{k}"
+            attrs = group["epochs"].attrs
+            t_s = e["sample_index"] / attrs["fs_hz"]
+            axes[0].plot(t_s, e["cn0_dbhz"], lw=0.8, color=color, label=_label(group))
+            truth = satellite_truth(h5, b"G" if attrs["signal"] == "L1CA" else b"E", attrs["prn"])
+            if len(truth) > 1:
+                errors = tracking_errors(e, truth, attrs["fs_hz"], attrs["signal"])
+                axes[1].plot(errors["t_s"], errors["code_m"], lw=0.6, color=color)
+                axes[2].plot(errors["t_s"], errors["doppler_hz"], lw=0.6, color=color)
+        for ax, label, limit in zip(
+            axes, ("C/N0 (dB-Hz)", "code (m)", "Doppler (Hz)"), (None, 60, 20), strict=True
+        ):
+            ax.set_ylabel(label)
+            if limit:
+                ax.set_ylim(-limit, limit)
+            for begin, end in spans:
+                ax.axvspan(begin, end, color="C3", alpha=0.12, lw=0)
+        axes[0].legend(ncol=8, fontsize=7)
+        axes[-1].set_xlabel("time (s)")
+    return path
+
+
+def _attacked_peak(h5: h5py.File, channels: dict[str, h5py.Group], directory: Path) -> Path | None:
+    """Correlation function of the satellite that is hit hardest, before and during the attack."""
+    spans = _attacks(h5)
+    hit = [g for g in channels.values() if "corr" in g and g["corr"].shape[1] >= 3 and len(g["epochs"]) > 100]
+    if not spans or not hit:
+        return None
+
+    def parts(group: h5py.Group) -> tuple[np.ndarray, np.ndarray]:
+        t_s = group["epochs"]["sample_index"] / group["epochs"].attrs["fs_hz"]
+        inside = np.any([(t_s > a + 0.1) & (t_s < b - 0.1) for a, b in spans], axis=0)
+        return (t_s < spans[0][0]) & (t_s > t_s[0] + 1.0), inside
+
+    def distortion(group: h5py.Group) -> float:
+        before, during = parts(group)
+        magnitude = np.abs(group["corr"][:])
+        if before.sum() < 10 or during.sum() < 10:
+            return -1.0
+        clean = magnitude[before].mean(axis=0)
+        return float(np.mean(np.abs(magnitude[during].mean(axis=0) - clean)) / clean.max())
+
+    group = max(hit, key=distortion)
+    if distortion(group) < 0:
+        return None
+    before, during = parts(group)
+    taps = group["corr"].attrs["taps_chips"]
+    order, path = np.argsort(taps), directory / "correlation_attack.png"
+    prompt = int(np.argmin(np.abs(taps)))
+    with figure(
+        path, f"Correlation function of {_label(group)}: in-phase part, 10 to 90 % of the epochs"
+    ) as ax:
+        for mask, label, color in ((before, "before", "C0"), (during, "during", "C3")):
+            corr = group["corr"][:][mask]
+            real = (corr * np.exp(-1j * np.angle(corr[:, prompt : prompt + 1]))).real[:, order]
+            low, middle, high = np.quantile(real, [0.1, 0.5, 0.9], axis=0)
+            ax.plot(taps[order], middle, ".-", ms=4, color=color, label=f"{label} the attack")
+            ax.fill_between(taps[order], low, high, color=color, alpha=0.2, lw=0)
+        ax.set(xlabel="tap offset (chip, early positive)", ylabel="amplitude (ADC levels)")
+        ax.legend(fontsize=8)
     return path
