@@ -5,6 +5,7 @@ nothing else: no truth and no start time enters. When there is no position, ``re
 why.
 """
 
+from copy import copy
 from typing import Annotated, Literal
 
 import numpy as np
@@ -163,6 +164,17 @@ class Navigator:
         except NoFix as why:
             self.reason = str(why)
             return self._coast(transmit, ephemeris)
+
+    def klobuchar(self, iono_utc_gps):
+        """Ionosphere parameters in force: (alpha, beta), or None where the correction is switched off."""
+        return self._klobuchar(iono_utc_gps)
+
+    def handover(self):
+        """What a steering filter starts from: (copy of the receiver clock, clock bias in it (m), ISB (m) or None)."""
+        if self._state is None:
+            raise NoFix("there is no fix to start from.")
+        known = self._isb_known or (self._filter_sample >= 0 and self._p[8, 8] < 100.0)
+        return copy(self.clock), float(self._state[3]), float(self._state[4]) if known else None
 
     # -- which satellites --
 

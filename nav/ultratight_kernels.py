@@ -51,9 +51,12 @@ ECEF17, KINEMATIC = 2, 3
 N_X, ACC, ISB = 32, 27, 30
 """Length of the nominal state; ECEF acceleration (3) of the last prediction; inter-system bias, m."""
 
-N_CN0 = 6
-"""Columns of a channel's power monitor: prompt power fast and slow, noise power fast, weight of each, C/N0 (Hz)."""
-P_FAST, P_SLOW, N_FAST, WEIGHT, NIS_MEAN, CN0_HZ = range(6)
+N_CN0 = 7
+"""Columns of a channel's power monitor: prompt power fast and slow, noise power fast, time watched, mean of squared
+range innovations, C/N0 (Hz), signal power remembered from when it was strong."""
+P_FAST, P_SLOW, N_FAST, WEIGHT, NIS_MEAN, CN0_HZ, SIGNAL = range(7)
+STRONG = 10.0
+"""C/N0 T above which the signal's own power is learnt."""
 
 TABLE_LOW_DB, TABLE_STEP_DB = -20.0, 0.5
 """Grid of the discriminator table: C/N0 T in dB; columns code gain, code variance (chips^2), frequency gain and
@@ -284,7 +287,8 @@ def cn0_from_powers(power, active, span_s, cn0_out):
     """C/N0 (Hz) of every channel from the fast means, as pessimistic as fast and slow, own and common noise allow.
 
     C/N0 = (min(P_fast, P_slow) - N) / (N T), N the median of all channels' noise, or the own one where it is twice
-    that: a jammer that rises is in the common noise at once, one that hits a single code in its own.
+    that: a jammer that rises is in the common noise at once, one that hits a single code in its own. Never more than the
+    remembered signal power allows.
     """
     n = power.shape[0]
     noise = np.empty(n)
@@ -305,6 +309,12 @@ def cn0_from_powers(power, active, span_s, cn0_out):
         prompt = min(power[c, P_FAST], power[c, P_SLOW])
         value = prompt / max(density, 1e-30) - 1.0 / span_s[c]
         cn0_out[c] = max(value, 0.5)
+        if value * span_s[c] > STRONG and power[c, WEIGHT] > 0.2:
+            k = 1.0 if power[c, SIGNAL] == 0.0 else 0.01
+            power[c, SIGNAL] += k * (prompt - density / span_s[c] - power[c, SIGNAL])
+        elif power[c, SIGNAL] > 0.0:
+            # Among noise the estimate scatters upwards to gains and weights that are not there: a signal gets no stronger.
+            cn0_out[c] = min(cn0_out[c], power[c, SIGNAL] / density)
         power[c, CN0_HZ] = cn0_out[c]
 
 

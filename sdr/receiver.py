@@ -15,17 +15,22 @@ import numpy as np
 
 from nav.measurements import transmit_rows
 from nav.records import SOLUTION
+from nav.steering import Sensors, Steering
 from sdr.scenario import ReceiverSpec
 from signals.modulation import SIGNALS
 from tracking.acquisition import acquire, slab_samples
 from tracking.channel import STATE_IDLE, STATE_LOCKED, STATE_LOST
-from tracking.records import ACQUISITION
+from tracking.records import ACQUISITION, AIDING
 from tracking.telemetry import Telemetry
 
 SEARCHED = {"G": "L1CA", "E": "E1C"}
 """Signal that is searched for each system; it also names the component that carries the loops."""
 ENOUGH = 4
 """Satellites tracked below which everything is searched again and again."""
+SOLUTION_EVERY = 5
+"""Steered positions are reported every so many navigation epochs."""
+TAKE_EVERY = 25
+"""New channels are put under command every so many navigation epochs."""
 RETRY_S = 1.0
 """A satellite that was lost is looked for again this soon."""
 
@@ -53,12 +58,14 @@ class Outcome:
     """(channel, EPOCH rows, corr (n, K)) of every channel that finished integrations."""
     observations: list[np.ndarray] = field(default_factory=list)
     solutions: list[np.ndarray] = field(default_factory=list)
+    steering: np.ndarray | None = None
+    """STEERING row where a filter steers the channels."""
 
 
 class Receiver:
     """Run of a ReceiverSpec on samples of one source."""
 
-    def __init__(self, spec: ReceiverSpec, source: Source) -> None:
+    def __init__(self, spec: ReceiverSpec, source: Source, sensors: Sensors | None = None) -> None:
         self.spec = spec
         self.mitigation = spec.mitigation.start(source) if spec.mitigation else None
         self.source = self.mitigation or source
@@ -66,9 +73,12 @@ class Receiver:
         self.tracker = spec.tracking.start(source.fs_hz, source.if_hz)
         self.telemetry = Telemetry(self.tracker)
         self.navigator = spec.navigation.start(source.fs_hz)
+        self.steering = self._start_steering(sensors)
+        self._aiding: np.ndarray | None = None
         self.channel_of: dict[tuple[str, int], int] = {}
         self.searched: dict[str, list[int]] = {}
         self.position = 0
+        self._week: int | None = None
         self._recent: list[tuple[int, np.ndarray]] = []
         self._lost: list[tuple[str, int]] = []
         self._next_search = self._next_retry = self._full_searches = self._turn = 0
@@ -77,7 +87,10 @@ class Receiver:
     def __iter__(self) -> Iterator[Outcome]:
         # The first slab is what one search takes; after it, slabs divide the time between positions.
         period_s = 1.0 / self.spec.navigation.rate_hz
-        per_period = math.ceil(period_s / (self.spec.slab_ms * 1e-3) - 1e-9)
+        longest_s = self.spec.slab_ms * 1e-3
+        if self.steering is not None:
+            longest_s = 1.0 / self.spec.steering.update_hz
+        per_period = math.ceil(period_s / longest_s - 1e-9)
         ends = (round(k * period_s / per_period * self.fs_hz) for k in count(1))
         for k, end in enumerate(ends, 1):
             if self.position == 0 and self._wanted < end:
@@ -97,13 +110,16 @@ class Receiver:
         n_end = n0 + iq.shape[1]
         # Searching comes first: a new channel starts with this slab, so that nothing of a short file is lost.
         found = self._search(n0, iq)
-        epochs, counts, corr = self.tracker.process(n0, iq)
+        epochs, counts, corr = self.tracker.process(n0, iq, self._commands())
         self.telemetry.update()
         self.position = n_end
         rows = [(c, epochs[c, :n], corr[c, :n]) for c, n in enumerate(counts) if n]
         out = Outcome(n0, n_end, found, rows)
-        if navigate:
+        if self.steering is not None and self.steering.filter is not None:
+            self._steer(n_end, epochs, counts, out)
+        elif navigate:
             self._navigate(n_end, out)
+            self._hand_over(n_end, out)
         return out
 
     # -- acquisition ------------------------------------------------------------------------------------------------
@@ -208,6 +224,70 @@ class Receiver:
             sample, r["signal"], r["prn"], r["code_period"], [p for p, _ in reference], [t for _, t in reference],
             r["code_phase_chips"], r["doppler_hz"], r["carrier_phase_cycles"], r["cn0_dbhz"], r["lock_s"], slips,
         )  # fmt: skip
+
+    # -- steering: the hand-over back to tracking, one slab later -----------------------------------------------------
+
+    def _start_steering(self, sensors: Sensors | None) -> Steering | None:
+        spec = self.spec.steering
+        if spec.mode == "scalar":
+            return None
+        tracking = self.spec.tracking
+        if tracking.l1ca.integration_ms * 1e-3 > 1.001 / spec.update_hz:
+            raise ValueError(
+                f"receiver.steering.update_hz = {spec.update_hz:g} is faster than the integrations of "
+                f"{tracking.l1ca.integration_ms} ms: lower it"
+            )
+        spacing = {"L1CA": tracking.l1ca.early_late_space_chips, "E1": tracking.e1.early_late_space_chips}
+        mask_rad = math.radians(self.spec.navigation.elevation_mask_deg)
+        return Steering(spec, self.fs_hz, sensors, spacing, mask_rad)
+
+    def _commands(self) -> np.ndarray | None:
+        """AIDING of the slab that begins: what navigation left at the last one's end, for new channels nothing."""
+        if self._aiding is None:
+            return None
+        commands = np.zeros(len(self.tracker.channels), AIDING)
+        commands[: len(self._aiding)] = self._aiding
+        return commands
+
+    def _steer(self, sample: int, epochs: np.ndarray, counts: np.ndarray, out: Outcome) -> None:
+        steering = self.steering
+        self._aiding = steering.advance(
+            sample, epochs, counts, self.tracker.channels["state"], self.telemetry.ephemerides()
+        )
+        out.steering = steering.record.copy()
+        if steering.filter is None:
+            return
+        if self._week is not None and steering.filter.epochs % SOLUTION_EVERY == 0:
+            out.solutions.append(steering.solution(self._week))
+        if steering.filter.epochs % TAKE_EVERY == 0:
+            steering.take(self._phase_locked(), self.telemetry.ephemerides())
+
+    def _hand_over(self, sample: int, out: Outcome) -> None:
+        """Let the filter take the channels over from a scalar fix."""
+        if self.steering is None or not out.solutions:
+            return
+        row = out.solutions[-1][0]
+        self._week = int(row["week"])
+        klobuchar = (
+            self.navigator.klobuchar(self.telemetry.iono_utc("G")),
+            self.navigator.spec.tropo != "none",
+        )
+        self.steering.try_start(
+            sample, row, self.navigator, self._phase_locked(), self.telemetry.ephemerides(), klobuchar
+        )
+        self._aiding = None
+
+    def _phase_locked(self) -> list[tuple[int, str, int, float]]:
+        replica = self.tracker.snapshot(self.position)
+        rows = []
+        for (signal, prn), c in self.channel_of.items():
+            if (
+                replica["state"][c] == STATE_LOCKED
+                and replica["phase_locked"][c]
+                and replica["lock_s"][c] > 0.5
+            ):
+                rows.append((c, signal, prn, float(replica["cn0_dbhz"][c])))
+        return rows
 
     # -- report -----------------------------------------------------------------------------------------------------
 

@@ -14,7 +14,10 @@ from typing import Annotated, Any, TypeVar
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from nav.imu import ImuSpec, OdometerSpec, simulate_imu, simulate_odometer
 from nav.navigator import NavigationSpec
+from nav.steering import Sensors
+from nav.ultratight import SteeringSpec
 from signals.clock import ClockSpec
 from signals.faults import FaultSpec, faulty
 from signals.frontend import FrontEndSpec
@@ -41,12 +44,22 @@ class ReceiverSpec(BaseModel):
     tracking: TrackingSpec = TrackingSpec()
     navigation: NavigationSpec = NavigationSpec()
     mitigation: MitigationSpec | None = None
+    steering: SteeringSpec = SteeringSpec()
     slab_ms: Annotated[int, Field(ge=20, le=1000, multiple_of=20)] = 200
     """Longest slab of samples that passes through the loop at once; the results hardly depend on it."""
     search_every_s: Annotated[float, Field(gt=0)] = 5.0
     """All satellites are searched again this often while too few are tracked."""
     search_one_every_s: Annotated[float, Field(gt=0)] = 10.0
     """Later, one satellite in turn is searched this often."""
+
+
+class SensorsSpec(BaseModel):
+    """Section ``[sensors]``: what is mounted beside the antenna; simulated from the motion, or read from CSV files."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    imu: ImuSpec = ImuSpec()
+    odometer: OdometerSpec | None = None
 
 
 class Scenario(BaseModel):
@@ -66,6 +79,7 @@ class Scenario(BaseModel):
     jammer: tuple[JammerSpec, ...] = ()
     multipath: MultipathSpec | None = None
     fault: tuple[FaultSpec, ...] = ()
+    sensors: SensorsSpec | None = None
     receiver: ReceiverSpec = ReceiverSpec()
 
 
@@ -83,6 +97,21 @@ def source(spec: Scenario, threads: int = 1) -> SyntheticSource:
         jammers=jammers(spec, spec.front_end.fs_hz, spec.front_end.if_hz, spec.front_end.complex, sky),
         echoes=echoes(spec, [s.name for s in sky.satellites]), threads=threads,
     )  # fmt: skip
+
+
+def sensors(spec: Scenario) -> Sensors | None:
+    """The scenario's IMU and odometer, simulated from its motion; None where it has no ``[sensors]``."""
+    if spec.sensors is None:
+        return None
+    motion = spec.motion.start()
+    fs_hz, span_s = spec.front_end.fs_hz, spec.duration_s
+    imu = simulate_imu(motion, spec.sensors.imu, _child(spec, SENSORS, 0), span_s, fs_hz)[0]
+    odometer = None
+    if spec.sensors.odometer is not None:
+        odometer = simulate_odometer(motion, spec.sensors.odometer, _child(spec, SENSORS, 1), span_s, fs_hz)[
+            0
+        ]
+    return Sensors(spec.sensors.imu, spec.sensors.odometer, imu, odometer)
 
 
 def jammers(spec: Scenario, fs_hz: float, if_hz: float, is_complex: bool, sky: Sky | None) -> list[JammerRun]:

@@ -8,6 +8,7 @@ from numba import njit
 from nav.kernels import solve_position, solve_velocity
 from nav.ultratight_kernels import (
     CN0_HZ,
+    N_CN0,
     clock_columns,
     clock_states,
     cn0_from_powers,
@@ -122,7 +123,7 @@ def aided_run(rng, model, x, p, sensors, per_epoch, dt_s, filter_s, rates, q_dia
     zeros, which = np.zeros(count), np.zeros(count, np.int64)
     rho, rate, accel, los = np.zeros(count), np.zeros(count), np.zeros(count), np.zeros((count, 3))
     span_s, seen, inflate = np.full(count, T), np.ones(count, np.int64), np.ones(count)
-    power, cn0 = np.zeros((count, 6)), np.full(count, 1e4)
+    power, cn0 = np.zeros((count, N_CN0)), np.full(count, 1e4)
     code_m, rate_mps, off_m, off_mps = np.zeros(count), np.zeros(count), np.zeros(count), np.zeros(count)
     gain_code, gain_rate = np.ones(count), np.ones(count)
     rho_nco, rate_nco = np.zeros(count), np.zeros(count)
@@ -227,7 +228,7 @@ def scalar_run(rng, pos0, T, half_space, sat_pos, sat_vel, rho_true, rate_true, 
     """
     count = cn0_hz.size
     rho_nco, rate_nco, ramp = np.zeros(count), np.zeros(count), np.zeros(count)
-    power, bad_s = np.zeros((count, 6)), np.zeros(count)
+    power, bad_s = np.zeros((count, N_CN0)), np.zeros(count)
     lost = np.zeros(count, np.bool_)
     meas, truth = np.zeros((count, 4)), np.zeros((count, 2))
     state, cov, residual, los = np.zeros(5), np.zeros((5, 5)), np.zeros(count), np.zeros((count, 3))

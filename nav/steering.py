@@ -1,0 +1,381 @@
+"""Run of ``[receiver.steering]``: from the scalar receiver's fix to NCO commands, epoch after epoch, and back.
+
+The hand-over to tracking is an AIDING row per channel, stamped with the sample from which it holds. A filter that no longer
+knows a range to half a chip or a rate to half the discriminator's reach lets go: the channels return to their own loops, and
+the next scalar fix starts it anew. Nothing diverges silently.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from nav import pvt
+from nav import ultratight_kernels as kernels
+from nav.imu import ImuSpec, OdometerSpec
+from nav.records import SATELLITE, SOLUTION, STEERING
+from nav.riss import speed_at
+from nav.ultratight import (
+    COASTING,
+    LOST,
+    SCALAR,
+    STEERED,
+    USABLE_CN0_HZ,
+    Filter,
+    SteeringSpec,
+    build_model,
+    discriminator_table,
+    nominal_of,
+    start_covariance,
+)
+from signals.constants import C_MPS, SECONDS_PER_WEEK
+from signals.orbits import orbit_coefficients
+from signals.records import EPHEMERIS
+from tracking.lock import STATE_LOCKED
+from tracking.records import AIDING
+
+SLOTS = 24
+"""Channels that one filter can hold."""
+MIN_CN0_DBHZ = 30.0
+"""A channel is taken over in phase lock at this C/N0 at the least."""
+REFRESH_S = 1.0
+"""Atmosphere and ephemerides are renewed this often."""
+INCONSISTENT_RATIO = 6.0
+"""Mean of NIS over its degrees of freedom through a second, beyond which the filter is not believed."""
+
+
+@dataclass(frozen=True)
+class Sensors:
+    """Rows of an IMU and an odometer that cover the samples, with the Specs that describe their noise."""
+
+    imu_spec: ImuSpec
+    odometer_spec: OdometerSpec | None
+    imu: np.ndarray
+    odometer: np.ndarray | None
+
+    def table(self) -> np.ndarray:
+        """Sensor rows (m, N_SENSOR) at IMU times."""
+        out = np.zeros((self.imu.size, kernels.N_SENSOR))
+        out[:, :3], out[:, 3:6] = self.imu["gyro_rad_s"], self.imu["accel_mps2"]
+        if self.odometer is not None:
+            out[:, 6] = speed_at(self.odometer, self.imu["t_s"])
+        return out
+
+
+class Steering:
+    """Run of a SteeringSpec in vector or ultra-tight mode.
+
+    After ``advance``: ``state``, ``record`` (STEERING row), ``reason`` (why it is not steering).
+    """
+
+    def __init__(
+        self,
+        spec: SteeringSpec,
+        fs_hz: float,
+        sensors: Sensors | None,
+        spacing_chips: dict[str, float],
+        min_elevation_rad=0.0,
+    ):
+        self.spec, self.fs_hz, self.sensors = spec, float(fs_hz), sensors
+        self.min_elevation_rad = min_elevation_rad
+        self.model = build_model(
+            spec, sensors.imu_spec if sensors else None, sensors.odometer_spec if sensors else None
+        )
+        self.per_epoch, self.dt_s = 1, 1.0 / spec.update_hz
+        self._table, self._sensor_sample = np.zeros((0, kernels.N_SENSOR)), np.zeros(0, np.int64)
+        if spec.mode == "ultra_tight":
+            self._read_sensors()
+        self._tables = np.stack(
+            [
+                discriminator_table("L1CA", spacing_chips["L1CA"]),
+                discriminator_table("E1", spacing_chips["E1"]),
+            ]
+        )
+        self.state, self.reason, self.filter = SCALAR, "waiting for a scalar fix", None
+        self.record = np.zeros(1, STEERING)
+        self.sample = -1
+        self._fix_since = self._coast_since = -1
+        self._n_released = 0
+        self._slots()
+
+    def _slots(self):
+        self.active, self.slot = np.zeros(SLOTS, np.bool_), np.zeros(SLOTS, np.int64)
+        self.second, self.period_s = np.zeros(SLOTS), np.full(SLOTS, 1e-3)
+        self.delay, self.delay_rate = np.zeros(SLOTS), np.zeros(SLOTS)
+        self.inflate, self.which = np.ones(SLOTS), np.zeros(SLOTS, np.int64)
+        self.orbit, self.toe_toc_tgd = np.zeros((SLOTS, 19)), np.zeros((SLOTS, 3))
+        self.name: list[tuple[str, int] | None] = [None] * SLOTS
+        self._ratio, self._next_refresh = 1.0, 0
+
+    def _read_sensors(self):
+        rate = self.sensors.imu_spec.rate_hz
+        step = float(np.median(np.diff(self.sensors.imu["t_s"])))
+        if abs(step * rate - 1.0) > 1e-3:
+            raise ValueError(
+                f"IMU rows come every {step:.6g} s, but sensors.imu.rate_hz = {rate:g}: set it to {1 / step:.6g}"
+            )
+        per = rate / self.spec.update_hz
+        if per < 1 or abs(per - round(per)) > 1e-6:
+            raise ValueError(
+                f"sensors.imu.rate_hz = {rate:g} is not a multiple of receiver.steering.update_hz = {self.spec.update_hz:g}"
+            )
+        self.per_epoch, self.dt_s = round(per), 1.0 / rate
+        self._table = self.sensors.table()
+        self._sensor_sample = self.sensors.imu["sample_index"].astype(np.int64)
+
+    # -- start and end ------------------------------------------------------------------------------------------
+
+    def try_start(self, sample: int, solution, navigator, channels, ephemerides, klobuchar) -> bool:
+        """Take over at ``sample`` from a scalar fix there, when all that is needed is known; else ``reason`` says what not.
+
+        ``channels``: (tracker index, signal, prn, cn0_dbhz) of those in phase lock.
+        """
+        if solution is None or not bool(solution["valid"]):
+            self._fix_since = -1
+            self.reason = "waiting for a scalar fix"
+            return False
+        if self._fix_since < 0:
+            self._fix_since = sample
+        if sample - self._fix_since < self.spec.start_after_s * self.fs_hz:
+            self.reason = "scalar fixes settle"
+            return False
+        clock, bias_m, isb_m = navigator.handover()
+        try:
+            self._begin(sample, solution, bias_m, isb_m)
+        except ValueError as err:
+            self.reason = str(err)
+            return False
+        self._clock, self._klobuchar = clock, klobuchar
+        self._estimate_isb = isb_m is not None
+        has_gps = any(signal == "L1CA" for _, signal, _, _ in channels)
+        self._reference = "G" if has_gps else "E"
+        self.sample = sample
+        self._predict_only(sample)
+        self.take(channels, ephemerides)
+        self.refresh(ephemerides)
+        if int(self.active.sum()) < self.spec.min_satellites:
+            self.reason = f"{int(self.active.sum())} of {self.spec.min_satellites} satellites can be steered"
+            self.filter = None
+            self._slots()
+            return False
+        self.state, self.reason, self._coast_since = STEERED, "", -1
+        return True
+
+    def _begin(self, sample, solution, bias_m, isb_m):
+        pos, vel = np.array(solution["pos_ecef_m"]), np.array(solution["vel_ecef_mps"])
+        azimuth = None if self.spec.heading_deg is None else math.radians(self.spec.heading_deg)
+        speed = None
+        if self._table.size:
+            row = min(
+                int(np.searchsorted(self._sensor_sample, sample, side="right")) - 1, len(self._table) - 1
+            )
+            speed = float(self._table[max(row, 0), 6])
+        x = nominal_of(
+            self.model, pos, vel, bias_m, float(solution["clock_drift_mps"]), isb_m or 0.0, azimuth,
+            speed if self.spec.model != "ecef17" else None,
+        )  # fmt: skip
+        moving = max(float(np.linalg.norm(vel)), 1.0)
+        imu = self.sensors.imu_spec if self.sensors else None
+        p = start_covariance(
+            self.model, x, pos_m=self.spec.range_sigma_m, vel_mps=0.2, bias_m=2.0 * self.spec.range_sigma_m, drift_mps=0.3,
+            heading_rad=min(0.01 + 0.25 / moving, 0.3), isb_m=5.0 if isb_m is not None else 300.0, imu=imu,
+        )  # fmt: skip
+        self.filter = Filter(self.spec, self.model, x, p, SLOTS)
+
+    def release(self, reason: str) -> np.ndarray:
+        """Let all channels go."""
+        self.state, self.reason, self.filter = LOST, reason, None
+        self._fix_since, self._coast_since = -1, -1
+        self._n_released += 1
+        self._slots()
+        return np.zeros(0, AIDING)
+
+    # -- channels -----------------------------------------------------------------------------------------------
+
+    def take(self, channels, ephemerides):
+        """Put channels in phase lock under command; those with an ephemeris, above the mask, that agree in code."""
+        newest = {(e["system"].decode(), int(e["prn"])): e for e in ephemerides}
+        for index, signal, prn, cn0_dbhz in channels:
+            system = "G" if signal == "L1CA" else "E"
+            if (signal, prn) in self.name or cn0_dbhz < MIN_CN0_DBHZ or (system, prn) not in newest:
+                continue
+            if newest[system, prn]["health"] != 0 or (system != self._reference and not self._estimate_isb):
+                continue
+            free = np.flatnonzero(~self.active)
+            if free.size == 0:
+                return
+            i = int(free[0])
+            self.active[i], self.slot[i], self.name[i] = True, index, (signal, prn)
+            self.second[i] = float(system != self._reference)
+            self.period_s[i], self.which[i] = (1e-3, 0) if system == "G" else (4e-3, 1)
+            self.filter.power[i] = 0.0
+            self._set_orbit(i, newest[system, prn])
+            self.filter.rho[i] = 2.2e7 + self.filter.clock()[0]
+            self._next_refresh = 0
+
+    def _set_orbit(self, i, eph):
+        self.orbit[i] = orbit_coefficients(np.array([eph], EPHEMERIS))[0]
+        self.toe_toc_tgd[i] = eph["toe_s"], eph["toc_s"], eph["tgd_s"]
+
+    def drop(self, i: int):
+        """Leave channel slot i to its own loops."""
+        self.active[i], self.name[i] = False, None
+
+    def refresh(self, ephemerides):
+        """Newest ephemerides, atmosphere and elevation of all channels."""
+        newest = {(e["system"].decode(), int(e["prn"])): e for e in ephemerides}
+        rows = np.flatnonzero(self.active)
+        for i in rows:
+            signal, prn = self.name[i]
+            eph = newest.get(("G" if signal == "L1CA" else "E", prn))
+            if eph is not None:
+                self._set_orbit(i, eph)
+        pos, vel = self.filter.position()
+        sats = np.zeros(rows.size, SATELLITE)
+        tow, frac = self._receiver_tow(self.sample)
+        sat_pos, sat_vel = np.zeros((SLOTS, 3)), np.zeros((SLOTS, 3))
+        unused = np.zeros((SLOTS, 3)), np.zeros(SLOTS), np.zeros(SLOTS)
+        kernels.satellites_at(
+            self.orbit, self.toe_toc_tgd, self.active, tow, frac, self.filter.rho, sat_pos, sat_vel, *unused
+        )
+        sats["pos_ecef_m"], sats["vel_ecef_mps"] = sat_pos[rows], sat_vel[rows]
+        pvt.look(sats, pos, vel, tow + frac, self._klobuchar[0], self._klobuchar[1])
+        self.delay[rows] = sats["iono_m"] + sats["tropo_m"]
+        self.delay_rate[rows] = sats["atmosphere_rate_mps"]
+        for i, el in zip(rows, sats["elevation_rad"]):
+            if el < self.min_elevation_rad:
+                self.drop(int(i))
+        self._next_refresh = self.sample + round(REFRESH_S * self.fs_hz)
+
+    def _receiver_tow(self, sample):
+        ms, frac_s = self._clock.read(sample)
+        whole = ms // 1000
+        return float(whole % SECONDS_PER_WEEK), (ms - whole * 1000) * 1e-3 + frac_s
+
+    # -- one epoch ----------------------------------------------------------------------------------------------
+
+    def advance(self, sample: int, epochs, counts, channels_state, ephemerides) -> np.ndarray:
+        """Predict to ``sample``, update from the epochs of the slab that ends there, command the next one.
+
+        ``epochs``, ``counts``: of ``Tracker.process``; ``channels_state`` (C,) STATE_* of the tracker's channels.
+        Returns AIDING (C,).
+        """
+        for i in np.flatnonzero(self.active):
+            if channels_state[self.slot[i]] != STATE_LOCKED:
+                self.drop(int(i))
+        if sample >= self._next_refresh:
+            self.refresh(ephemerides)
+        commands = np.zeros(len(channels_state), AIDING)
+        nis, rows, _ = self._step(sample, epochs, counts, commands)
+        self._judge(sample, nis, rows)
+        self._report(sample, nis, rows)
+        if self.state == LOST:
+            return np.zeros(len(channels_state), AIDING)
+        return commands
+
+    def _step(self, sample, epochs, counts, commands):
+        f = self.filter
+        sensors = self._sensors(sample)
+        dt_s = self.dt_s if sensors.shape[0] > 1 or self._table.size else (sample - self.sample) / self.fs_hz
+        ms, frac_s = self._clock.read(sample)
+        tow, tow_frac = self._receiver_tow(sample)
+        log = f.slot()
+        log["t_s"][0] = sample / self.fs_hz
+        nis, rows, seen = kernels.navigation_epoch(
+            f.code, f.x, f.p, sensors, dt_s, f.filter_s, f.rates, f.q, self.spec.limit_sigma, self.spec.fast_cn0_s,
+            self.spec.slow_cn0_s, self.spec.code_floor_m, self.spec.rate_floor_mps, sample, self.fs_hz, ms, frac_s, tow,
+            tow_frac, self.orbit, self.toe_toc_tgd, self.active, self.slot, self.second, self.period_s, self.delay,
+            self.delay_rate, self.inflate, self._tables, self.which, epochs, counts, f.power, f.cn0, f.rho, f.rate, f.accel,
+            f.los, f.f, log["phi"][0], log["qd"][0], log["h"][0], log["r"][0], log["var"][0], log["used"][0], log["k"][0],
+            log["s"][0], log["p"][0], f.dx, commands,
+        )  # fmt: skip
+        f.nis, f.n_rows = nis, rows
+        self.sample = sample
+        return nis, rows, seen
+
+    def _sensors(self, sample):
+        """Sensor rows of the epoch that ends at ``sample``; vector mode has one empty row."""
+        if not self._table.size:
+            return np.zeros((1, kernels.N_SENSOR))
+        last = int(np.searchsorted(self._sensor_sample, sample + 1, side="right"))
+        first = last - self.per_epoch
+        if first < 0 or last > len(self._table):
+            raise ValueError(
+                f"sensor data do not cover sample {sample}; record them over the whole time of the samples"
+            )
+        return self._table[first:last]
+
+    def _predict_only(self, sample):
+        """Ranges and unit vectors before the first step."""
+        self.filter.rho[:] = 2.2e7 + self.filter.clock()[0]
+
+    def _judge(self, sample, nis, rows):
+        """State from what is seen and how well the next interval is known."""
+        f = self.filter
+        usable = int(np.sum(f.cn0[self.active] > USABLE_CN0_HZ))
+        if rows:
+            self._ratio += (nis / rows - self._ratio) / self.spec.update_hz
+        sigma = np.zeros(2)
+        kernels.predicted_sigma(f.code, f.x, f.p, f.los, self.active, sigma)
+        self.sigma, self.usable = sigma, usable
+        if usable >= 1:
+            self.state, self._coast_since = STEERED, -1
+        else:
+            self.state = COASTING
+            self._coast_since = sample if self._coast_since < 0 else self._coast_since
+        why = ""
+        if not np.isfinite(f.x).all() or not np.isfinite(sigma).all():
+            why = "the filter's state is not finite"
+        elif sigma[0] > self.spec.release_code_m:
+            why = (
+                f"a range is predicted no better than {sigma[0]:.0f} m: too coarse for the code discriminator"
+            )
+        elif sigma[1] > self.spec.release_rate_mps:
+            why = f"a rate is predicted no better than {sigma[1]:.1f} m/s: too coarse for the frequency discriminator"
+        elif usable >= self.spec.min_satellites and self._ratio > INCONSISTENT_RATIO:
+            why = f"innovations are {self._ratio:.0f} times what the filter expects"
+        if why:
+            self._sigma_2d = math.inf
+            self.release(why)
+
+    def _report(self, sample, nis, rows):
+        r = self.record[0]
+        r["sample_index"], r["t_s"], r["state"] = sample, sample / self.fs_hz, self.state
+        r["nis"], r["rows"] = nis, rows
+        r["sigma_range_m"], r["sigma_rate_mps"] = self.sigma
+        r["n_steered"], r["n_used"] = int(self.active.sum()), self.usable
+        if self.filter is not None:
+            r["sigma_2d_m"] = kernels.horizontal_sigma(self.filter.code, self.filter.x, self.filter.p)
+            r["cn0_median_dbhz"] = (
+                10.0 * math.log10(max(float(np.median(self.filter.cn0[self.active])), 1.0))
+                if self.active.any()
+                else 0.0
+            )
+
+    def solution(self, week: int) -> np.ndarray:
+        """SOLUTION row of the last epoch; valid while the filter steers with satellites or coasts within 50 m."""
+        f, row = self.filter, np.zeros(1, SOLUTION)
+        pos, vel = f.position()
+        bias, drift = f.clock()
+        tow, frac = self._receiver_tow(self.sample)
+        r = row[0]
+        r["sample_index"], r["t_s"], r["week"] = self.sample, self.sample / self.fs_hz, week
+        r["tow_s"] = (tow + (frac - bias / C_MPS)) % SECONDS_PER_WEEK
+        r["pos_ecef_m"], r["vel_ecef_mps"] = pos, vel
+        r["clock_bias_m"], r["clock_drift_mps"], r["isb_m"] = (
+            bias,
+            drift,
+            f.x[kernels.ISB] if self._estimate_isb else np.nan,
+        )
+        r["cov_ecef_m2"] = f.covariance()
+        r["gdop"] = r["pdop"] = r["hdop"] = r["vdop"] = np.nan
+        r["n_used"], r["chi2"], r["dof"] = self.usable, f.nis, f.n_rows
+        r["valid"] = self.state == STEERED or (self.state == COASTING and self.record[0]["sigma_2d_m"] < 50.0)
+        return row
+
+    def names(self) -> list[str]:
+        """Satellites under command, G07 for instance."""
+        return [f"{'G' if n[0] == 'L1CA' else 'E'}{n[1]:02d}" for n in self.name if n is not None]
+
+
+__all__ = ["SLOTS", "Sensors", "Steering"]
