@@ -18,7 +18,6 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from monitors.baselines import Cn0Drop, NoiseFloor, SignalQuality
 from monitors.batch import line_offset_hz, start_monitors, sum_dumps, trial_seed
 from monitors.detection import HIT_LIMIT, cluster_rate, p_md_event, p_md_hazard, rate
 from monitors.fft import FftMonitor
@@ -26,14 +25,11 @@ from monitors.glrt import GlrtMonitor
 from monitors.multichannel_ar import MultichannelAr
 from monitors.threshold import AnalyticNull, EmpiricalNull, GaussianNull, ParetoNull, per_epoch, requirement
 from sdr.scenario import validate
+from sdr.watch import Detector, one_blas_thread
 from signals.constants import METRES_PER_CHIP, WAVELENGTH_M
 from tracking.correlator_model import Twin, TwinCW, TwinNBI
 from tracking.twin_kernels import hatch_smooth
 
-Detector = Annotated[
-    FftMonitor | GlrtMonitor | MultichannelAr | Cn0Drop | NoiseFloor | SignalQuality,
-    Field(discriminator="kind"),
-]
 MAX_POINTS = 20_000
 MAX_FILE_BYTES = 1 << 20
 CURVE_BINS = 20
@@ -381,25 +377,12 @@ def _quiet_corr(campaign: Campaign, group: int, root: int, trial: int, n_epochs:
     return sum_dumps(twin(n_epochs)[1], spec.dumps)
 
 
-@lru_cache(maxsize=1)
-def _blas() -> Any:
-    import scipy.linalg  # noqa: F401  (brings a BLAS of its own, which must be loaded to be limited)
-    from threadpoolctl import ThreadpoolController
-
-    return ThreadpoolController()
-
-
-def _one_thread() -> Any:
-    """Products by one BLAS thread: how they are cut up among several would show in the last bit."""
-    return _blas().limit(limits=1, user_api="blas")
-
-
 def quiet_statistics(text: str, group: int, first: int, count: int) -> list[list[np.ndarray]]:
     """Values of every monitor on trials of the threshold set: one list of arrays per trial."""
     campaign = _campaign(text)
     spec = campaign.spec
     out = []
-    with _one_thread():
+    with one_blas_thread():
         runs = _trained(text, group)
         for trial in range(first, first + count):
             corr = _quiet_corr(campaign, group, spec.seeds.threshold, trial, spec.threshold.epochs)
@@ -461,7 +444,7 @@ def evaluate_trials(
     """TRIAL rows (count x monitors) of the evaluation set; a pure function of its arguments."""
     campaign = _campaign(text)
     one = _open_trial if campaign.spec.loop == "open" else _closed_trial
-    with _one_thread():
+    with one_blas_thread():
         runs = _trained(text, campaign.group[point])
         parts = [one(campaign, runs, point, trial, thresholds) for trial in range(first, first + count)]
     return np.concatenate(parts)
@@ -469,7 +452,7 @@ def evaluate_trials(
 
 def warm_up(text: str, point: int) -> None:
     """Train what a point needs, in this process."""
-    with _one_thread():
+    with one_blas_thread():
         _trained(text, _campaign(text).group[point])
 
 
