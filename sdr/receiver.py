@@ -58,6 +58,8 @@ class Outcome:
     """(channel, EPOCH rows, corr (n, K)) of every channel that finished integrations."""
     observations: list[np.ndarray] = field(default_factory=list)
     solutions: list[np.ndarray] = field(default_factory=list)
+    statistics: list[tuple[str, np.ndarray]] = field(default_factory=list)
+    """(monitor, MONITOR rows) of what the monitors made of the correlator outputs."""
     steering: np.ndarray | None = None
     """STEERING row where a filter steers the channels."""
 
@@ -75,6 +77,7 @@ class Receiver:
         self.navigator = spec.navigation.start(source.fs_hz)
         self.steering = self._start_steering(sensors)
         self._aiding: np.ndarray | None = None
+        self.monitors = [m.start(source.fs_hz) for m in spec.monitor]
         self.channel_of: dict[tuple[str, int], int] = {}
         self.searched: dict[str, list[int]] = {}
         self.position = 0
@@ -120,6 +123,7 @@ class Receiver:
         elif navigate:
             self._navigate(n_end, out)
             self._hand_over(n_end, out)
+        self._watch(out)
         return out
 
     # -- acquisition ------------------------------------------------------------------------------------------------
@@ -288,6 +292,29 @@ class Receiver:
             ):
                 rows.append((c, signal, prn, float(replica["cn0_dbhz"][c])))
         return rows
+
+    # -- monitors ---------------------------------------------------------------------------------------------------
+
+    def _watch(self, out: Outcome) -> None:
+        """Let every monitor see the windows of taps; nothing comes back."""
+        channels = self.tracker.channels
+        for monitor in self.monitors:
+            for c, epochs, corr in out.epochs:
+                signal, prn, k = channels["signal"][c].decode(), int(channels["prn"][c]), self.tracker.window(c)
+                taps = self._nominal_taps(signal), self.tracker.taps_chips(c)[:k]
+                rows = monitor(signal, prn, epochs, corr[:, :k], taps, self.waveform(signal))
+                if len(rows):
+                    out.statistics.append((monitor.spec.name, rows))
+
+    def _nominal_taps(self, signal: str) -> np.ndarray:
+        window = (self.spec.tracking.l1ca if signal == "L1CA" else self.spec.tracking.e1).taps
+        return window.spacing_chips * (np.arange(window.count) - window.count // 2)
+
+    def waveform(self, signal: str) -> str:
+        """Waveform of the replica of a signal."""
+        if signal == "L1CA":
+            return "BPSK"
+        return "BOC11" if self.spec.tracking.e1.replica == "BOC11" else SIGNALS[signal].waveform
 
     # -- report -----------------------------------------------------------------------------------------------------
 

@@ -12,12 +12,13 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from nav.imu import ImuSpec, OdometerSpec, simulate_imu, simulate_odometer
 from nav.navigator import NavigationSpec
 from nav.steering import Sensors
 from nav.ultratight import SteeringSpec
+from sdr.watch import WatchSpec
 from signals.clock import ClockSpec
 from signals.faults import FaultSpec, faulty
 from signals.frontend import FrontEndSpec
@@ -51,6 +52,24 @@ class ReceiverSpec(BaseModel):
     """All satellites are searched again this often while too few are tracked."""
     search_one_every_s: Annotated[float, Field(gt=0)] = 10.0
     """Later, one satellite in turn is searched this often."""
+    monitor: tuple[WatchSpec, ...] = ()
+    """Monitors on the live correlator outputs."""
+
+    @model_validator(mode="after")
+    def _monitors(self) -> "ReceiverSpec":
+        names = [m.name for m in self.monitor]
+        twice = sorted({n for n in names if names.count(n) > 1})
+        if twice:
+            raise ValueError(f"two monitors are called '{twice[0]}': names must differ")
+        loops = {"G": ("l1ca", self.tracking.l1ca), "E": ("e1", self.tracking.e1)}
+        for system in self.acquisition.systems:
+            section, spec = loops[system]
+            if self.monitor and spec.taps is None:
+                raise ValueError(
+                    f"monitors need a window of taps: give receiver.tracking.{section}.taps = {{ count = 35, "
+                    "spacing_chips = 0.65 } or the like"
+                )
+        return self
 
 
 class SensorsSpec(BaseModel):
