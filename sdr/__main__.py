@@ -100,6 +100,8 @@ def receive(
     *,
     recording: Recording = Recording(),
     scenario: Annotated[str | None, Parameter(help="Scenario whose [receiver] section is used.")] = None,
+    imu: Annotated[Path | None, Parameter(help="CSV of an IMU, aligned to the first sample.")] = None,
+    odometer: Annotated[Path | None, Parameter(help="CSV of an odometer.")] = None,
     output: Out = None,
     plots: Annotated[bool, Parameter(negative="", help="Draw the figures beside the results.")] = False,
     json: Json = False,
@@ -110,7 +112,16 @@ def receive(
     from sdr import jobs
 
     result = jobs.receive(
-        file, recording, scenario, output=output, overrides=set_, threads=threads, plots=plots, quiet=json
+        file,
+        recording,
+        scenario,
+        output=output,
+        overrides=set_,
+        threads=threads,
+        plots=plots,
+        quiet=json,
+        imu=imu,
+        odometer=odometer,
     )
     _report("receive", result, json)
 
@@ -168,6 +179,26 @@ def plot(
 
 
 @app.command
+def export(
+    results: Path,
+    /,
+    *,
+    rinex_obs: Annotated[Path | None, Parameter(help="RINEX 3.05 observation file to write.")] = None,
+    nmea: Annotated[Path | None, Parameter(help="NMEA 0183 file to write (GGA, RMC, GSA, VTG).")] = None,
+    kml: Annotated[Path | None, Parameter(help="KML file to write.")] = None,
+    gpx: Annotated[Path | None, Parameter(help="GPX file to write.")] = None,
+    mat: Annotated[Path | None, Parameter(help="Directory for GNSS-SDR's tracking dumps (.mat).")] = None,
+    csv: Annotated[Path | None, Parameter(help="Directory for one CSV per dataset.")] = None,
+    json: Json = False,
+) -> None:
+    """Write a results file in the formats of others."""
+    from sdr import export as exporter
+
+    result = exporter.export(results, rinex_obs=rinex_obs, nmea=nmea, kml=kml, gpx=gpx, mat=mat, csv_dir=csv)
+    _report("export", result, json)
+
+
+@app.command
 def lines(
     *,
     signal: Annotated[str | None, Parameter(help="L1CA, E1B or E1C; all if not given.")] = None,
@@ -186,6 +217,54 @@ def lines(
     from sdr import lines as liner
 
     _report("lines", liner.lines(signal, waveform, prn, top, tiered, plots), json)
+
+
+@app.command
+def counterfactual(
+    scenario: str,
+    /,
+    *,
+    without: Annotated[
+        list[str],
+        Parameter(
+            name="--without",
+            negative="",
+            consume_multiple=True,
+            help="Factors to leave out: jammer multipath dynamics quantisation.",
+        ),
+    ],
+    output: Annotated[
+        Path | None, Parameter(name=["--output", "-o"], help="Directory for the figure.")
+    ] = None,
+    json: Json = False,
+    set_: Set = [],  # noqa: B006
+    threads: Threads = 1,
+) -> None:
+    """Replay a scenario's noise with and without its jammers, echoes, dynamics or quantisation: what each does."""
+    from sdr import counterfactual as replay
+
+    result = replay.counterfactual(
+        scenario, without, output=output, overrides=set_, threads=threads, quiet=json
+    )
+    _report("counterfactual", result, json)
+
+
+@app.command
+def inject(
+    file: Path,
+    scenario: str,
+    /,
+    *,
+    recording: Recording = Recording(),
+    output: Annotated[Path, Parameter(name=["--output", "-o"], help="Recording to write (base name).")],
+    json: Json = False,
+    set_: Set = [],  # noqa: B006
+) -> None:
+    """Add a scenario's jammers and echoes to a recording, at exact J/N, through gain control and quantiser."""
+    from sdr import inject as injector
+
+    result = injector.inject(file, recording, scenario, output, overrides=set_, quiet=json)
+    _report("inject", result, json)
 
 
 @app.command

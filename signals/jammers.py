@@ -161,7 +161,7 @@ class _Jammer(BaseModel):
             self, fs_hz, if_hz, jn0_dbhz, float(amplitude(jn0_dbhz, fs_hz, is_complex)),
             math.ceil(self.start_s * fs_hz - 1e-6),
             2**62 if self.stop_s is None else math.ceil(self.stop_s * fs_hz - 1e-6),
-            line_hz, phase_cycles, self._follow(sky), kernel, args,
+            line_hz, phase_cycles, self._follow(sky), duration_s, kernel, args,
         )  # fmt: skip
         run.rms = math.sqrt(0.5 * duty * run.mean_power(duration_s))
         run.check(duration_s, is_complex)
@@ -437,6 +437,7 @@ class JammerRun:
     phase_cycles: float
     sky: Sky | None
     """The one satellite whose Doppler is followed."""
+    duration_s: float
     kernel: Callable
     args: tuple
     rms: float = 0.0
@@ -501,7 +502,9 @@ class JammerRun:
         out[:, 1] = (steady_hz + freq_hz + rate_hz_s * since) * d
         out[:, 2] = 0.5 * rate_hz_s * d * d
         if self.sky is not None:
-            now = self.sky.propagate(second + np.arange(CELLS_PER_S + 1) / CELLS_PER_S)
+            # Cells beyond the run's end are not used, and the clock is not known there.
+            nodes = second + np.arange(CELLS_PER_S + 1) / CELLS_PER_S
+            now = self.sky.propagate(np.minimum(nodes, self.duration_s + 0.08))
             out -= F_L1_HZ * hermite_cells(now.phase_delay_s, now.phase_delay_rate_s_s)[:, 0]
             if self.line_hz:
                 out -= self.line_hz * hermite_cells(now.delay_s, now.delay_rate_s_s)[:, 0]
