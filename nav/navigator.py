@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from nav import kernels, pvt
 from nav.measurements import Hatch, ReceiverClock, observables
 from nav.pvt import NoFix
-from nav.records import OBSERVATION, SATELLITE, SOLUTION
+from nav.records import OBSERVATION, SATELLITE, SOLUTION, VIEW
 from signals.constants import C_MPS, SECONDS_PER_WEEK
 
 STEER_ABOVE_M = 1e-4 * C_MPS
@@ -175,6 +175,15 @@ class Navigator:
             raise NoFix("there is no fix to start from.")
         known = self._isb_known or (self._filter_sample >= 0 and self._p[8, 8] < 100.0)
         return copy(self.clock), float(self._state[3]), float(self._state[4]) if known else None
+
+    def view(self):
+        """VIEW rows: the satellites of the last epoch that had observations, in their order."""
+        rows = np.zeros(self.satellites.size, VIEW)
+        for name in SATELLITE.names or ():
+            rows[name] = self.satellites[name]
+        rows["sample_index"] = self.observations["sample_index"]
+        rows["used"] = [_name(s["system"], s["prn"]) in self.used for s in self.satellites]
+        return rows
 
     # -- which satellites --
 

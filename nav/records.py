@@ -61,6 +61,9 @@ SATELLITE = np.dtype(
 )
 """A satellite at transmission and, once a position is known, as seen from it; row i = observation i."""
 
+VIEW = np.dtype([("sample_index", "u8"), *((n, SATELLITE[n]) for n in SATELLITE.names or ()), ("used", "?")])
+"""A satellite as the position stage saw it at one epoch; ``used`` says whether it entered the position."""
+
 SOLUTION = np.dtype(
     [
         ("sample_index", "u8"),

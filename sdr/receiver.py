@@ -58,6 +58,8 @@ class Outcome:
     """(channel, EPOCH rows, corr (n, K)) of every channel that finished integrations."""
     observations: list[np.ndarray] = field(default_factory=list)
     solutions: list[np.ndarray] = field(default_factory=list)
+    views: list[np.ndarray] = field(default_factory=list)
+    """VIEW rows: where the satellites of a position stood."""
     statistics: list[tuple[str, np.ndarray]] = field(default_factory=list)
     """(monitor, MONITOR rows) of what the monitors made of the correlator outputs."""
     steering: np.ndarray | None = None
@@ -212,8 +214,11 @@ class Receiver:
         solution = self.navigator.update(
             rows, self.telemetry.ephemerides(), self.telemetry.iono_utc("G"), self.telemetry.iono_utc("E")
         )
-        if len(self.navigator.observations):
-            out.observations.append(self.navigator.observations)
+        seen = self.navigator.observations
+        if len(seen) and seen["sample_index"][0] == sample:
+            out.observations.append(seen)
+            if solution is not None:
+                out.views.append(self.navigator.view())
         if solution is not None:
             out.solutions.append(np.atleast_1d(np.asarray(solution, SOLUTION)))
 

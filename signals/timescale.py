@@ -31,3 +31,22 @@ def week_tow(gps_time: datetime) -> tuple[int, int]:
 def calendar(week: int, tow_s: float) -> datetime:
     """Calendar GPS time of a continuous week and second of week (microsecond resolution)."""
     return GPS_EPOCH + timedelta(days=7 * int(week), seconds=float(tow_s))
+
+
+LEAP_SECONDS = (
+    (datetime(1999, 1, 1), 13),
+    (datetime(2006, 1, 1), 14),
+    (datetime(2009, 1, 1), 15),
+    (datetime(2012, 7, 1), 16),
+    (datetime(2015, 7, 1), 17),
+    (datetime(2017, 1, 1), 18),
+)
+"""UTC dates from which GPS time is this many seconds ahead (IERS Bulletin C 16 to 52)."""
+
+
+def leap_seconds(gps_time: datetime) -> int:
+    """GPS minus UTC in whole seconds at a calendar GPS time from 1999 on; ValueError before."""
+    for start, seconds in reversed(LEAP_SECONDS):
+        if gps_time - timedelta(seconds=seconds) >= start:
+            return seconds
+    raise ValueError(f"{gps_time:%Y-%m-%d} precedes {LEAP_SECONDS[0][0]:%Y}: its leap seconds are not listed")
