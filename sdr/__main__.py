@@ -199,47 +199,6 @@ def export(
 
 
 @app.command
-def export(
-    results: Path,
-    /,
-    *,
-    rinex_obs: Annotated[Path | None, Parameter(help="RINEX 3.05 observation file to write.")] = None,
-    nmea: Annotated[Path | None, Parameter(help="NMEA 0183 file to write (GGA, RMC, GSA, VTG).")] = None,
-    kml: Annotated[Path | None, Parameter(help="KML file to write.")] = None,
-    gpx: Annotated[Path | None, Parameter(help="GPX file to write.")] = None,
-    mat: Annotated[Path | None, Parameter(help="Directory for GNSS-SDR's tracking dumps (.mat).")] = None,
-    csv: Annotated[Path | None, Parameter(help="Directory for one CSV per dataset.")] = None,
-    json: Json = False,
-) -> None:
-    """Write a results file in the formats of others."""
-    from sdr import export as exporter
-
-    result = exporter.export(results, rinex_obs=rinex_obs, nmea=nmea, kml=kml, gpx=gpx, mat=mat, csv_dir=csv)
-    _report("export", result, json)
-
-
-@app.command
-def lines(
-    *,
-    signal: Annotated[str | None, Parameter(help="L1CA, E1B or E1C; all if not given.")] = None,
-    waveform: Annotated[
-        str | None, Parameter(help="BPSK, BOC11, CBOC+ or CBOC-; all that fit if not given.")
-    ] = None,
-    prn: Annotated[int | None, Parameter(help="One PRN; all if not given.")] = None,
-    top: Annotated[int, Parameter(help="Lines to list per signal and waveform, or for one PRN.")] = 5,
-    tiered: Annotated[
-        bool, Parameter(negative="", help="E1-C with its secondary code (100 ms period).")
-    ] = False,
-    plots: Annotated[Path | None, Parameter(help="Write the figures into this directory.")] = None,
-    json: Json = False,
-) -> None:
-    """List the strongest code spectrum lines: where a CW jammer hurts most."""
-    from sdr import lines as liner
-
-    _report("lines", liner.lines(signal, waveform, prn, top, tiered, plots), json)
-
-
-@app.command
 def lines(
     *,
     signal: Annotated[str | None, Parameter(help="L1CA, E1B or E1C; all if not given.")] = None,

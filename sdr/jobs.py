@@ -8,7 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from nav.sensor_files import write_imu, write_odometer
+from nav.steering import Sensors
 from sdr import iffile, scenario
+from sdr.modes import SideBySide, table
+from sdr.modes import draw as draw_modes
 from sdr.receiver import Outcome, Receiver
 from sdr.scenario import ReceiverSpec, Scenario
 from sdr.spectrum import EVERY_S, Watched
@@ -40,7 +44,9 @@ def run(
     source = scenario.source(spec, threads)
     path = Path(output) if output else Path(f"{spec.name}.h5")
     with Store(path, command="run", scenario=text, seed=spec.seed) as store:
-        result = _receive(spec.receiver, source, store, spec.name, quiet)
+        side = SideBySide(spec, Watched(source), scenario.sensors(spec)) if spec.receiver.steering.compare else None
+        sensors = scenario.sensors(spec) if spec.receiver.steering.mode == "ultra_tight" else None
+        result = _receive(spec.receiver, source, store, spec.name, quiet, sensors, side)
     return _finish(result, path, plots)
 
 
@@ -54,13 +60,16 @@ def receive(
     threads: int = 1,
     plots: bool = False,
     quiet: bool = False,
+    imu: Path | None = None,
+    odometer: Path | None = None,
 ) -> dict[str, Any]:
     """Receive a recording with the receiver of scenario ``name`` (default: the default receiver)."""
     spec, text = _receiver(name, overrides, threads)
     source = iffile.open_recording(file, iffile.declaration(file, recording))
     path = Path(output) if output else Path.cwd() / (Path(file).stem + ".results.h5")
     with Store(path, command="receive", scenario=text, seed=None) as store:
-        result = _receive(spec, source, store, Path(file).name, quiet)
+        sensors = scenario.read_sensors(name, overrides, imu, odometer, source)
+        result = _receive(spec, source, store, Path(file).name, quiet, sensors)
     return _finish(result, path, plots)
 
 
@@ -92,7 +101,7 @@ def simulate(
             advance(done)
         truth.up_to(done, last=True)
     elapsed = time.perf_counter() - begin
-    files = [str(p) for p in writer.files] + [str(truth_path)]
+    files = [str(p) for p in writer.files] + [str(truth_path)] + _write_sensors(spec, base)
     duration_s = source.n_samples / source.fs_hz
     satellites = [
         {"signal": s.signal, "prn": s.prn, "cn0_dbhz": float(s.cn0_dbhz)}
@@ -108,6 +117,20 @@ def simulate(
         "real_time_factor": duration_s / elapsed,
         "text": text_out + "\n".join(f"  {f}" for f in files),
     }
+
+
+def _write_sensors(spec: Scenario, base: Path) -> list[str]:
+    """The scenario's IMU and odometer as CSV beside its recording."""
+    sensors = scenario.sensors(spec)
+    if sensors is None:
+        return []
+    imu = base.with_name(base.name + ".imu.csv")
+    write_imu(imu, sensors.imu)
+    if sensors.odometer is None:
+        return [str(imu)]
+    odometer = base.with_name(base.name + ".odo.csv")
+    write_odometer(odometer, sensors.odometer)
+    return [str(imu), str(odometer)]
 
 
 def acquire(
@@ -172,11 +195,31 @@ class _Tally:
         self.locked_s: dict[tuple[str, int], float] = {}
         self.fixes: list[np.ndarray] = []
         self.used: dict[str, None] = {}
+        self.levels: list[np.ndarray] = []
+
+    def stanford(self, source: Any, receiver: Receiver) -> dict[str, Any] | None:
+        """Counts of the Stanford diagram, horizontal and vertical; None without truth or protection levels."""
+        sky = getattr(source, "sky", None)
+        if sky is None or not self.levels or not self.fixes:
+            return None
+        from sdr.errors import stanford_counts
+
+        fixes = np.concatenate(self.fixes)
+        true = sky.receiver(fixes["sample_index"] / receiver.fs_hz)
+        return stanford_counts(fixes, true["pos_ecef_m"], np.concatenate(self.levels))
 
 
-def _receive(spec: ReceiverSpec, source: Any, store: Store, label: str, quiet: bool) -> dict[str, Any]:
-    watched = Watched(source)
-    receiver = Receiver(spec, watched)
+def _receive(
+    spec: ReceiverSpec,
+    source: Any,
+    store: Store,
+    label: str,
+    quiet: bool,
+    sensors: Sensors | None = None,
+    side: SideBySide | None = None,
+) -> dict[str, Any]:
+    watched = side.source if side else Watched(source)
+    receiver = side.primary if side else Receiver(spec, watched, sensors)
     truth = _Truth(source, store)
     tally = _Tally()
     begin = time.perf_counter()
@@ -184,6 +227,8 @@ def _receive(spec: ReceiverSpec, source: Any, store: Store, label: str, quiet: b
         with _progress(label, source.n_samples, quiet) as advance:
             for outcome in receiver:
                 _store_outcome(store, receiver, outcome, tally)
+                if side:
+                    side.follow(outcome)
                 store.append("samples/spectrum", watched.rows(), fs_hz=source.fs_hz, if_hz=source.if_hz, every_s=EVERY_S)
                 truth.up_to(outcome.n_end)
                 if store.due():
@@ -199,7 +244,11 @@ def _receive(spec: ReceiverSpec, source: Any, store: Store, label: str, quiet: b
         "real_time_factor": duration_s / (time.perf_counter() - begin),
         "satellites": receiver.satellites(tally.locked_s),
         "monitors": _monitors(receiver),
+        "protection": tally.stanford(source, receiver),
     }
+    if side:
+        side.store(store)
+        result["modes"] = side.modes()
     result["fix"], result["no_fix_reason"] = _fix(receiver, source, tally), None
     if result["fix"] is None:
         result["no_fix_reason"] = _why_no_fix(receiver, duration_s, result["satellites"])
@@ -225,8 +274,15 @@ def _store_outcome(store: Store, receiver: Receiver, outcome: Outcome, tally: _T
         tally.locked_s[signal, prn] += float(epochs["n_samples"][locked].sum()) / receiver.fs_hz
     for name, rows in outcome.statistics:
         store.append(f"monitors/{name}", rows)
+    for part in outcome.integrity:
+        for name, rows in part.items():
+            store.append(f"monitors/{name}", rows)
+        if "protection" in part:
+            tally.levels.append(part["protection"])
     for rows in outcome.observations:
         store.append("navigation/observations", rows)
+    if outcome.steering is not None:
+        store.append("navigation/steering", outcome.steering)
     for rows in outcome.views:
         store.append("navigation/satellites", rows)
     for row in outcome.solutions:
@@ -304,7 +360,7 @@ def _monitors(receiver: Receiver) -> list[dict[str, Any]]:
             found = [{k: float(a[k]) for k in ("start_s", "end_s", "peak")} for a in alarms[key]]
             head = {"name": monitor.spec.name, "signal": key[0], "prn": key[1]}
             out.append(head | numbers | {"tests": int(row["tests"]), "alarms": found})
-    return out
+    return out + ([] if receiver.integrity is None else receiver.integrity.report())
 
 
 def _fix(receiver: Receiver, source: Any, tally: _Tally) -> dict[str, Any] | None:
@@ -352,6 +408,8 @@ def _finish(result: dict[str, Any], path: Path, plots: bool) -> dict[str, Any]:
         from sdr.plot import plot
 
         result["figures"] = [str(p) for p in plot(path)]
+        if result.get("modes"):
+            result["figures"].append(str(draw_modes(path)))
     result["text"] = _summary(result)
     return result
 
@@ -380,6 +438,8 @@ def _summary(result: dict[str, Any]) -> str:
     for m in result["monitors"]:
         first = f", the first at {m['alarms'][0]['start_s']:.1f} s" if m["alarms"] else ""
         rows.append(f"{m['name']} on {m['signal']} {m['prn']}: {len(m['alarms'])} alarms in {m['tests']} tests{first}")
+    if result.get("modes"):
+        rows += table(result["modes"])
     rows.append(f"results in {result['output']}")
     rows += [f"  {p}" for p in result.get("figures", [])]
     return "\n".join(rows)

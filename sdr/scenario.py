@@ -16,8 +16,10 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from nav.imu import ImuSpec, OdometerSpec, simulate_imu, simulate_odometer
 from nav.navigator import NavigationSpec
+from nav.sensor_files import read_imu, read_odometer
 from nav.steering import Sensors
 from nav.ultratight import SteeringSpec
+from sdr.integrity import IntegritySpec, RespondSpec
 from sdr.watch import WatchSpec
 from signals.clock import ClockSpec
 from signals.faults import FaultSpec, faulty
@@ -53,10 +55,13 @@ class ReceiverSpec(BaseModel):
     search_one_every_s: Annotated[float, Field(gt=0)] = 10.0
     """Later, one satellite in turn is searched this often."""
     monitor: tuple[WatchSpec, ...] = ()
+    integrity: IntegritySpec | None = None
+    respond: RespondSpec = RespondSpec()
     """Monitors on the live correlator outputs."""
 
     @model_validator(mode="after")
     def _monitors(self) -> "ReceiverSpec":
+        self.respond.check(self.integrity)
         names = [m.name for m in self.monitor]
         twice = sorted({n for n in names if names.count(n) > 1})
         if twice:
@@ -131,6 +136,23 @@ def sensors(spec: Scenario) -> Sensors | None:
             0
         ]
     return Sensors(spec.sensors.imu, spec.sensors.odometer, imu, odometer)
+
+
+def read_sensors(
+    name: str | None, overrides: Sequence[str], imu: Path | None, odometer: Path | None, source: Any
+) -> Sensors | None:
+    """Recorded sensors of a recording; their noise is that of the scenario's ``[sensors]``, or the default grades."""
+    if imu is None:
+        if odometer is not None:
+            raise ValueError("--odometer needs --imu as well: the reduced system takes its turns from a gyro")
+        return None
+    spec = load(name, overrides)[0].sensors if name is not None else None
+    spec = spec or SensorsSpec()
+    duration_s = source.n_samples / source.fs_hz
+    rows = read_imu(imu, source.fs_hz, duration_s)
+    speeds = None if odometer is None else read_odometer(odometer, source.fs_hz, duration_s)
+    odometer_spec = spec.odometer if speeds is None else spec.odometer or OdometerSpec()
+    return Sensors(spec.imu, odometer_spec if speeds is not None else None, rows, speeds)
 
 
 def jammers(spec: Scenario, fs_hz: float, if_hz: float, is_complex: bool, sky: Sky | None) -> list[JammerRun]:
