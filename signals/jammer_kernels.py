@@ -273,8 +273,16 @@ def _interpolate(out, n, spread, taps, width, step):
                 )
 
 
+@njit(cache=True, nogil=True)
+def _spread(out, lattice, at, n, phases):
+    """out[k] = lattice[at + k // phases]."""
+    for r in range(phases):
+        for m in range(n):
+            out[_Q(m) * _Q(phases) + _Q(r)] = lattice[_Q(at) + _Q(m)]
+
+
 @njit(cache=True, nogil=True, fastmath=_FAST)
-def _linear(out, coarse, at, shift, step):
+def _linear(out, coarse, at, shift, step, wide):
     """out[k] on the line between coarse points; the first output is ``shift`` samples after coarse[at]."""
     if step == 1:
         for m in range(BLOCK):
@@ -282,6 +290,17 @@ def _linear(out, coarse, at, shift, step):
             out[k] = coarse[_Q(at) + k]
         return
     inverse = _F(1.0 / step)
+    if step < 16:
+        # Many short lines: point by point over all of them.
+        n = (shift + BLOCK - 1) // step + 1
+        for r in range(step):
+            w, v = _F(1) - _F(r) * inverse, _F(r) * inverse
+            for m in range(n):
+                j = _Q(at) + _Q(m)
+                wide[_Q(m) * _Q(step) + _Q(r)] = w * coarse[j] + v * coarse[j + _Q(1)]
+        for m in range(BLOCK):
+            out[_Q(m)] = wide[_Q(m) + _Q(shift)]
+        return
     k, j, begin = 0, at, shift
     while k < BLOCK:
         n = min(step - begin, BLOCK - k)
@@ -318,7 +337,7 @@ def add_narrowband(
     spread_i, spread_q = np.empty(n_spread, np.float32), np.empty(n_spread, np.float32)
     coarse_i, coarse_q = np.zeros(BLOCK + 2 * width, np.float32), np.zeros(BLOCK + 2 * width, np.float32)
     buf_i, buf_q = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
-    c, s = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
+    c, s, wide = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK + 64, np.float32)
     base_i, base_q, based = np.empty(SUB, np.float32), np.empty(SUB, np.float32), np.int64(-1)
     held, count, b0 = np.int64(-9), 0, lo // BLOCK
     for block in range(b0, (hi - 1) // BLOCK + 1):
@@ -348,14 +367,12 @@ def add_narrowband(
             spread_i[:n_points] = lattice_i[at : at + n_points]
             spread_q[:n_points] = lattice_q[at : at + n_points]
         else:
-            for m in range(n_points):
-                for r in range(m * phases, min((m + 1) * phases, n_spread)):
-                    spread_i[r] = lattice_i[at + m]
-                    spread_q[r] = lattice_q[at + m]
+            _spread(spread_i, lattice_i, at, min(n_points, n_spread // phases), phases)
+            _spread(spread_q, lattice_q, at, min(n_points, n_spread // phases), phases)
         _interpolate(coarse_i, n_coarse, spread_i, flat, width, phases)
         _interpolate(coarse_q, n_coarse, spread_q, flat, width, phases)
-        _linear(buf_i, coarse_i, j0 - m0 * phases, first - j0 * step, step)
-        _linear(buf_q, coarse_q, j0 - m0 * phases, first - j0 * step, step)
+        _linear(buf_i, coarse_i, j0 - m0 * phases, first - j0 * step, step, wide)
+        _linear(buf_q, coarse_q, j0 - m0 * phases, first - j0 * step, step, wide)
         if not still:
             based = _steady(c, s, block, cell0, n_cell, carrier, base_i, base_q, based)
             _rotate(buf_i, buf_q, c, s)
