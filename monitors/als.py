@@ -380,6 +380,16 @@ class Als(BaseModel):
         return AlsRun(self, rows)
 
 
+LEAST_USE = 0.5
+"""Share of a window in which a row must have been used to have its noise estimated by the live estimator."""
+
+
+def _often_used(log: EpochLog, rows: np.ndarray | None) -> np.ndarray:
+    """Those of ``rows`` (default all) that were used in enough epochs; the others keep the R of the log."""
+    rows = np.arange(log.used.shape[1]) if rows is None else np.asarray(rows)
+    return rows[log.used[:, rows].mean(axis=0) >= LEAST_USE]
+
+
 class AlsRun:
     """Call once per navigation epoch, right after the filter's update; returns an AlsResult when a window is full.
 
@@ -403,9 +413,10 @@ class AlsRun:
         self._seen = 0
         spec = self.spec
         try:
+            log = filt.log(need)
             self.result = estimate(
-                filt.log(need),
-                self.rows,
+                log,
+                _often_used(log, self.rows),
                 n_lags=spec.n_lags,
                 full=spec.full,
                 settle=spec.settle_epochs,

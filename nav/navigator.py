@@ -6,13 +6,14 @@ why.
 """
 
 from copy import copy
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from nav import kernels, pvt
 from nav.measurements import Hatch, ReceiverClock, observables
+from nav.navlog import EXCLUDED_M2, NavigatorLog, Remedy
 from nav.pvt import NoFix
 from nav.records import OBSERVATION, SATELLITE, SOLUTION, VIEW
 from signals.constants import C_MPS, SECONDS_PER_WEEK
@@ -103,6 +104,23 @@ class NavigationSpec(BaseModel):
         return Navigator(self, fs_hz)
 
 
+class Snapshot(NamedTuple):
+    """Ranges of one epoch as the integrity monitors see them, one row per satellite above the mask.
+
+    ``residual_m``: of least squares, or the filter's innovations; ``variance_m2`` as used (an excluded satellite has
+    ``use`` False), ``own_m2`` the receiver's own; ``second`` 1 where the inter-system bias is added.
+    """
+
+    names: list[str]
+    los: np.ndarray
+    second: np.ndarray
+    residual_m: np.ndarray
+    variance_m2: np.ndarray
+    own_m2: np.ndarray
+    use: np.ndarray
+    pos_ecef_m: np.ndarray
+
+
 def _name(system, prn):
     return f"{system.decode()}{int(prn):02d}"
 
@@ -128,6 +146,10 @@ class Navigator:
         self.excluded: list[str] = []
         self.residual_m = np.zeros(0)
         self.innovations = np.zeros((0, 3))
+        self.snapshot: Snapshot | None = None
+        self.log: NavigatorLog | None = None
+        """Set one to have the filter's epochs recorded; recording changes nothing."""
+        self._remedy: Remedy | None = None
         self._smoothing = np.ones(0)
         self._steered_m = 0.0
         self._state: np.ndarray | None = None  # (5,) last position, bias, ISB
@@ -140,7 +162,9 @@ class Navigator:
         self._last_range_sample = -1
         self._rejected_epochs = 0
 
-    def update(self, transmit, ephemeris, iono_utc_gps=None, iono_utc_galileo=None):
+    def update(
+        self, transmit, ephemeris, iono_utc_gps=None, iono_utc_galileo=None, remedy: Remedy | None = None
+    ):
         """One epoch.
 
         Parameters
@@ -149,12 +173,16 @@ class Navigator:
         ephemeris : EPHEMERIS rows, the latest of each satellite
         iono_utc_gps, iono_utc_galileo : IONO_UTC row or None
             Klobuchar parameters (GPS) and the GGTO (Galileo), as far as decoded.
+        remedy : Remedy or None
+            What the integrity monitors ask for; None changes nothing.
 
         Returns
         -------
         SOLUTION row, or None with ``reason`` set.
         """
         self.reason, self.notes, self.used, self.excluded = "", [], [], []
+        self.snapshot = None
+        self._take(remedy)
         try:
             obs, eph = self._select(transmit, np.atleast_1d(ephemeris))
             sats = pvt.satellites(obs, eph)
@@ -164,6 +192,16 @@ class Navigator:
         except NoFix as why:
             self.reason = str(why)
             return self._coast(transmit, ephemeris)
+
+    def _take(self, remedy):
+        """Note the remedy of this epoch; a state handed back replaces the filter's now."""
+        self._remedy = remedy
+        if remedy is None or (remedy.dx is None and remedy.p is None) or self._filter_sample < 0:
+            return
+        if remedy.dx is not None:
+            self._x += remedy.dx
+        if remedy.p is not None:
+            self._p[:] = remedy.p
 
     def klobuchar(self, iono_utc_gps):
         """Ionosphere parameters in force: (alpha, beta), or None where the correction is switched off."""
@@ -276,9 +314,31 @@ class Navigator:
         return int(eph["week"][0]) + round((float(eph["toe_s"][0]) - tow_s) / SECONDS_PER_WEEK)
 
     def _corrected(self, obs, sats, offset, field):
-        return obs[field] + sats["clock_m"] - sats["iono_m"] - sats["tropo_m"] + offset
+        corrected = obs[field] + sats["clock_m"] - sats["iono_m"] - sats["tropo_m"] + offset
+        if self._remedy is None:
+            return corrected
+        return corrected - self._asked(sats, "bias_m", 0.0)
+
+    def _asked(self, sats, field, otherwise):
+        """A field of the remedy for each satellite; ``otherwise`` where it says nothing."""
+        at = self._remedy.find(sats["system"], sats["prn"])
+        values = np.append(self._remedy.rows[field], otherwise)  # index -1 is the last
+        return values[at]
+
+    def _excluded(self, sats):
+        """(n,) bool: satellites that the remedy leaves out."""
+        if self._remedy is None:
+            return np.zeros(sats.size, bool)
+        return self._asked(sats, "exclude", False).astype(bool)
 
     def _variance(self, obs, sats):
+        own = self._own_variance(obs, sats)
+        if self._remedy is None:
+            return own
+        asked = self._asked(sats, "variance_m2", np.nan)
+        return np.where(np.isnan(asked), own, asked)
+
+    def _own_variance(self, obs, sats):
         return pvt.range_variance(
             obs["cn0_dbhz"],
             sats["elevation_rad"],
@@ -308,6 +368,7 @@ class Navigator:
             pvt.look(sats, start[:3], self._vel, tow_s, klobuchar, self.spec.tropo != "none")
             use = self._above_mask(sats)
             self._say_masked(use)
+            use[self._excluded(sats)] = 0
             corrected = self._corrected(obs, sats, offset, "pseudorange_smoothed_m")
             variance = self._variance(obs, sats)
             fix, out = pvt.raim(sats, corrected, variance, second, use, estimate, p_fa, start)
@@ -330,6 +391,17 @@ class Navigator:
             self._vel = velocity.vel_ecef_mps
             pvt.look(sats, fix.state[:3], self._vel, tow_s, klobuchar, self.spec.tropo != "none")
         self.residual_m = fix.residual_m
+        self._snap(
+            obs,
+            sats,
+            self._above_mask(sats) == 1,
+            fix.los,
+            second,
+            fix.residual_m,
+            variance,
+            fix.use == 1,
+            fix.state[:3],
+        )
         self.used = [_name(s, p) for s, p, u in zip(sats["system"], sats["prn"], fix.use) if u]
         state = self._settle(fix, estimate)
         if self.spec.kind == "ekf":
@@ -339,6 +411,20 @@ class Navigator:
         row["gdop"], row["pdop"], row["hdop"], row["vdop"] = gdop, pdop, hdop, vdop
         row["n_used"], row["chi2"], row["dof"] = int(fix.use.sum()), fix.chi2, fix.dof
         return row
+
+    def _snap(self, obs, sats, part, los, second, residual, variance, use, pos_ecef_m):
+        names = [_name(s, n) for s, n in zip(sats["system"][part], sats["prn"][part])]
+        own = self._own_variance(obs, sats)
+        self.snapshot = Snapshot(
+            names,
+            los[part],
+            second[part],
+            residual[part],
+            variance[part],
+            own[part],
+            use[part],
+            pos_ecef_m.copy(),
+        )
 
     def _say_masked(self, use):
         if use.sum() < 4:
@@ -399,6 +485,8 @@ class Navigator:
         self._reference = b"G" if b"G" in systems else b"E"
         self._filter_sample = self._last_range_sample = int(obs["sample_index"][0])
         self._rejected_epochs = 0
+        if self.log is not None:
+            self.log.restart()
 
     def _predict(self, sample):
         f = self.spec.filter
@@ -411,6 +499,8 @@ class Navigator:
             self._x, self._p, dt_s, f.accel_psd_m2_s3, f.clock_f_m2_s, f.clock_g_m2_s3, f.isb_psd_m2_s
         )
         self._filter_sample = sample
+        if self.log is not None:
+            self.log.predicted(dt_s, self._p, f)
 
     def _filter(self, obs, sats, eph, iono_utc_gps, iono_utc_galileo):
         sample = int(obs["sample_index"][0])
@@ -423,15 +513,42 @@ class Navigator:
         n = int(use.sum())
         ranges = self._corrected(obs, sats, offset, "pseudorange_m")[use]
         range_var = self._variance(obs, sats)[use]
+        out = self._excluded(sats)[use]
+        range_var[out] = EXCLUDED_M2
         rates = pvt.range_rate(obs, sats)[use]
-        rate_var = pvt.rate_variance(obs["cn0_dbhz"], self.spec.sigma_doppler_mps, 0.02)[use]
+        own_rate_var = pvt.rate_variance(obs["cn0_dbhz"], self.spec.sigma_doppler_mps, 0.02)[use]
+        rate_var = np.where(out, EXCLUDED_M2, own_rate_var)
         innovation, variance, taken = np.zeros(2 * n), np.zeros(2 * n), np.zeros(2 * n, np.uint8)
+        before = self._x.copy()
         kernels.pvt_update(
             self._x, self._p, np.ascontiguousarray(sats["pos_ecef_m"][use]),
             np.ascontiguousarray(sats["vel_ecef_mps"][use]), second[use], ranges, range_var, rates, rate_var,
             self.spec.filter.gate_sigma**2, innovation, variance, taken,
         )  # fmt: skip
+        taken[np.tile(out, 2)] = 0
         self.innovations = np.column_stack([innovation, variance, taken])
+        los = sats["pos_ecef_m"] - before[:3]
+        los /= np.linalg.norm(los, axis=1, keepdims=True)
+        part = np.zeros(obs.size, bool)
+        part[np.flatnonzero(use)[taken[:n] == 1]] = True
+        full = np.zeros((2, obs.size))
+        full[0, use], full[1, use] = innovation[:n], range_var
+        self._snap(obs, sats, use, los, second, full[0], full[1], part, before[:3])
+        if self.log is not None:
+            own = np.concatenate([self._own_variance(obs, sats)[use], own_rate_var])
+            both = np.concatenate([range_var, rate_var])
+            dx = self._x - before
+            self.log.updated(
+                sample / self.fs_hz,
+                self.snapshot.names,
+                los[use],
+                second[use],
+                innovation,
+                both,
+                own,
+                taken,
+                dx,
+            )
         self._watch(sample, n, int(taken[:n].sum()))
         names = [_name(s, p) for s, p in zip(sats["system"][use], sats["prn"][use])]
         self.used = [name for name, t in zip(names, taken[:n]) if t]

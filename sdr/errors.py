@@ -72,3 +72,32 @@ def satellite_truth(h5: h5py.File, system: bytes, prn: int) -> np.ndarray:
         return np.empty(0)
     rows = h5["truth/satellites"][:]
     return rows[(rows["system"] == system) & (rows["prn"] == prn)]
+
+
+def levels_and_errors(
+    solution: np.ndarray, true_ecef_m: np.ndarray, levels: np.ndarray
+) -> dict[str, tuple[np.ndarray, np.ndarray, float]]:
+    """{"horizontal", "vertical"}: |error|, protection level (n,), alert limit, at the epochs that have both.
+
+    ``solution`` SOLUTION (n,), ``true_ecef_m`` (n, 3) at its samples, ``levels`` rows of ``monitors/protection``.
+    """
+    from signals.geodesy import ecef_to_geodetic, ned_matrix
+
+    _, i, j = np.intersect1d(solution["sample_index"], levels["sample_index"], return_indices=True)
+    lat_rad, lon_rad, _ = ecef_to_geodetic(true_ecef_m[:1])
+    ned = (solution["pos_ecef_m"][i] - true_ecef_m[i]) @ ned_matrix(lat_rad[0], lon_rad[0]).T
+    h = levels[j]
+    return {
+        "horizontal": (np.hypot(ned[:, 0], ned[:, 1]), h["hpl_m"], float(levels["hal_m"][0])),
+        "vertical": (np.abs(ned[:, 2]), h["vpl_m"], float(levels["val_m"][0])),
+    }
+
+
+def stanford_counts(
+    solution: np.ndarray, true_ecef_m: np.ndarray, levels: np.ndarray
+) -> dict[str, dict[str, int]]:
+    """Epochs in each region of the Stanford diagram; "hazardous" counts HMI."""
+    from monitors.protection import stanford
+
+    parts = levels_and_errors(solution, true_ecef_m, levels)
+    return {k: stanford(error, level, limit) for k, (error, level, limit) in parts.items()}

@@ -62,6 +62,8 @@ class Outcome:
     """VIEW rows: where the satellites of a position stood."""
     statistics: list[tuple[str, np.ndarray]] = field(default_factory=list)
     """(monitor, MONITOR rows) of what the monitors made of the correlator outputs."""
+    integrity: list[dict[str, np.ndarray]] = field(default_factory=list)
+    """Rows of the integrity monitors by dataset name, one item per navigation epoch."""
     steering: np.ndarray | None = None
     """STEERING row where a filter steers the channels."""
 
@@ -80,6 +82,9 @@ class Receiver:
         self.steering = self._start_steering(sensors)
         self._aiding: np.ndarray | None = None
         self.monitors = [m.start(source.fs_hz) for m in spec.monitor]
+        self.integrity = spec.integrity.start(spec.respond, self.fs_hz) if spec.integrity else None
+        if self.integrity is not None:
+            self.integrity.watch(self.navigator)
         self.channel_of: dict[tuple[str, int], int] = {}
         self.searched: dict[str, list[int]] = {}
         self.position = 0
@@ -120,6 +125,7 @@ class Receiver:
         self.position = n_end
         rows = [(c, epochs[c, :n], corr[c, :n]) for c, n in enumerate(counts) if n]
         out = Outcome(n0, n_end, found, rows)
+        self._hear(rows)
         if self.steering is not None and self.steering.filter is not None:
             self._steer(n_end, epochs, counts, out)
         elif navigate:
@@ -212,8 +218,9 @@ class Receiver:
     def _navigate(self, sample: int, out: Outcome) -> None:
         rows = self.transmit(sample)
         solution = self.navigator.update(
-            rows, self.telemetry.ephemerides(), self.telemetry.iono_utc("G"), self.telemetry.iono_utc("E")
-        )
+            rows, self.telemetry.ephemerides(), self.telemetry.iono_utc("G"), self.telemetry.iono_utc("E"),
+            remedy=None if self.integrity is None else self.integrity.remedy,
+        )  # fmt: skip
         seen = self.navigator.observations
         if len(seen) and seen["sample_index"][0] == sample:
             out.observations.append(seen)
@@ -221,6 +228,9 @@ class Receiver:
                 out.views.append(self.navigator.view())
         if solution is not None:
             out.solutions.append(np.atleast_1d(np.asarray(solution, SOLUTION)))
+        if self.integrity is not None:
+            # What it asks for holds from the next epoch on: the hand-over to navigation, one epoch later.
+            out.integrity.append(self.integrity(self.navigator, sample))
 
     def transmit(self, sample: int) -> np.ndarray:
         """TRANSMIT rows of the locked channels at one receiver sample."""
@@ -299,6 +309,17 @@ class Receiver:
         return rows
 
     # -- monitors ---------------------------------------------------------------------------------------------------
+
+    def _hear(self, rows: list[tuple[int, np.ndarray, np.ndarray]]) -> None:
+        """Let the redundant-measurement estimator hear the channels' discriminators."""
+        if self.integrity is None or self.spec.integrity.noise_rmd is None:
+            return
+        channels = self.tracker.channels
+        for c, epochs, _ in rows:
+            signal, prn = channels["signal"][c].decode(), int(channels["prn"][c])
+            gps = signal == "L1CA"
+            loops = self.spec.tracking.l1ca if gps else self.spec.tracking.e1
+            self.integrity.hear(f"{'G' if gps else 'E'}{prn:02d}", epochs, loops)
 
     def _watch(self, out: Outcome) -> None:
         """Let every monitor see the windows of taps; nothing comes back."""
