@@ -198,10 +198,10 @@ class FrontEnd:
         """The next float32 (2, n) -> the samples that are ready; ``last``: all that are left."""
         imp = self.spec.impairments
         if imp is not None and (imp.lo_offset_hz or imp.phase_noise_rad):
-            iq = self._mix(iq)
+            iq = self._mix(iq, imp.lo_offset_hz)
         self._in += iq.shape[1]
         if self.spec.filter is not None:
-            iq = self._filter(iq, last)
+            iq = self._filter(iq, last and self.spec.filter.delay == "removed")
         if imp is not None:
             self._impair(imp, iq)
         if not self.spec.complex:
@@ -227,20 +227,20 @@ class FrontEnd:
             out[1] = 0
         return out
 
-    def _mix(self, iq: np.ndarray) -> np.ndarray:
+    def _mix(self, iq: np.ndarray, lo_offset_hz: float) -> np.ndarray:
         n = self._in + np.arange(iq.shape[1])
-        turns = np.mod(n * (self.spec.impairments.lo_offset_hz / self.spec.fs_hz), 1.0)
+        turns = np.mod(n * (lo_offset_hz / self.spec.fs_hz), 1.0)
         z = (iq[0] + 1j * iq[1]) * np.exp(1j * (self._wander(n) - 2 * math.pi * turns))
         return np.stack([z.real, z.imag]).astype(np.float32)
 
-    def _filter(self, iq: np.ndarray, last: bool) -> np.ndarray:
+    def _filter(self, iq: np.ndarray, drain: bool) -> np.ndarray:
         ahead = self._past.shape[1] // 2
-        if last and self.spec.filter.delay == "removed":
+        if drain:
             iq = np.concatenate([iq, np.zeros((2, ahead), np.float32)], axis=1)
         x = np.concatenate([self._past, iq], axis=1)
         self._past = x[:, x.shape[1] - self._past.shape[1] :].copy()
         out = np.empty(iq.shape, np.float32)
-        fir(x[0], x[1], *self._taps, out[0], out[1])
+        fir(x[0], x[1], self._taps[0], self._taps[1], out[0], out[1])
         drop = min(self._skip, out.shape[1])
         self._skip -= drop
         return np.ascontiguousarray(out[:, drop:])

@@ -172,24 +172,28 @@ class _Jammer(BaseModel):
             return self.jn0_dbhz
         if self.power_dbw is not None:
             return self.power_dbw - self.n0_dbw_hz
-        k = _row(sky, self.against, "against")
+        if self.js_db is None or self.against is None:
+            raise ValueError("the power is missing: give js_db with against, power_dbw or jn0_dbhz")
+        sky, k = _row(sky, self.against, "against")
         return self.js_db + float(sky.only([k]).propagate(np.array([self.start_s])).cn0_dbhz[0, 0])
 
     def _follow(self, sky: Sky | None) -> Sky | None:
         if self.line is None or not self.line.follow_doppler:
             return None
         name = f"{SIGNALS[self.line.signal].system}{self.line.prn:02d}"
-        return sky.only([_row(sky, name, "line")]) if sky is not None else _row(sky, name, "line")
+        sky, k = _row(sky, name, "line")
+        return sky.only([k])
 
 
-def _row(sky: Sky | None, name: str, key: str) -> int:
+def _row(sky: Sky | None, name: str, key: str) -> tuple[Sky, int]:
+    """The sky and the row of this satellite in it."""
     names = [] if sky is None else [s.name for s in sky.satellites]
-    if name not in names:
+    if sky is None or name not in names:
         raise ValueError(
             f"{key}: satellite {name} is not in the sky; there are {', '.join(names) or 'none'}"
             + ("; or set line.follow_doppler = false" if key == "line" else "")
         )
-    return names.index(name)
+    return sky, names.index(name)
 
 
 class CW(_Jammer):
@@ -251,12 +255,12 @@ class Pulsed(_Jammer):
     @property
     def width_hz(self):
         """Between the -20 dB points of a DME pulse; first nulls of a rectangle."""
-        return 0.68 / _PULSE_S if self.shape == "dme" else 2.0 * self.rate_hz / self.duty
+        return 0.68 / _PULSE_S if self.duty is None else 2.0 * self.rate_hz / self.duty
 
     def wave(self, fs_hz, seed, context):
         """See `_Jammer.wave`."""
         slot_s = 1.0 / self.rate_hz
-        if self.shape == "rectangular":
+        if self.duty is not None:
             return (
                 kernels.add_pulses,
                 (fs_hz, seed, slot_s, self.duty * slot_s, 0.0, False, self.random),
