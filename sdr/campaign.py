@@ -19,7 +19,15 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from monitors.batch import line_offset_hz, start_monitors, sum_dumps, trial_seed
-from monitors.detection import HIT_LIMIT, cluster_rate, p_md_event, p_md_hazard, rate
+from monitors.detection import (
+    HIT_LIMIT,
+    Rate,
+    clopper_pearson,
+    cluster_rate,
+    p_md_event,
+    p_md_hazard,
+    rate,
+)
 from monitors.fft import FftMonitor
 from monitors.glrt import GlrtMonitor
 from monitors.multichannel_ar import MultichannelAr
@@ -467,7 +475,17 @@ class _World:
         self.on = np.zeros(len(t_s), bool)
         if jammer is not None:
             self.on = (t_s >= jammer.start_s) & (t_s < jammer.end_s)
-        self.df_hz = line_offset_hz(twin, t_s) if self.cw else np.full(len(t_s), np.nan)
+        self.df_hz = _line_offset_hz(twin, t_s) if self.cw else np.full(len(t_s), np.nan)
+
+
+def _line_offset_hz(twin: Twin, t_s: np.ndarray) -> np.ndarray:
+    """Offset of the CW from its code line as the signal's Doppler moves: the nearest one, or under dynamics, which
+    sweep over many lines, the one it was aimed at."""
+    speed = twin.dynamics.at(t_s)[1]
+    if not speed.any() or twin.jammers[0].line is None:
+        return line_offset_hz(twin, t_s)
+    cw = twin.jammers[0]
+    return cw.offset_hz + cw.rate_hz_s * t_s + speed / WAVELENGTH_M
 
 
 def _closed_trial(campaign: Campaign, runs: dict, point: int, trial: int, thresholds: tuple) -> np.ndarray:
@@ -692,6 +710,10 @@ def point_rate(k: np.ndarray, n: np.ndarray, seed: int) -> Any:
         return rate(0, 0)
     if n.max() == 1 or len(n) == 1:
         return rate(int(k.sum()), int(n.sum()))
+    if np.count_nonzero(k) < 5 or np.count_nonzero(k < n) < 5:
+        # Too few trials of either kind to resample: as if each trial were a single test.
+        p, m = k.sum() / n.sum(), len(n)
+        return Rate(int(k.sum()), int(n.sum()), float(p), *clopper_pearson(p * m, m), float(m))
     size = -(-len(n) // 1000)
     edges = np.arange(0, len(n), size)
     return cluster_rate(np.add.reduceat(k, edges), np.add.reduceat(n, edges), seed)

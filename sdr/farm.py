@@ -76,6 +76,19 @@ def run(
     """Run (or go on with) the campaign ``name`` until every point has stopped."""
     campaign = load(name, tuple(overrides))
     path = Path(output) if output else Path(f"{campaign.spec.name}.h5")
+    return execute(campaign, path, workers=workers, scheduler=scheduler, plots=plots, quiet=quiet)
+
+
+def execute(
+    campaign: Campaign,
+    path: Path,
+    *,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    plots: bool = False,
+    quiet: bool = True,
+) -> dict[str, Any]:
+    """Run (or go on with) a campaign into ``path``; returns the command's JSON object."""
     begin = time.perf_counter()
     with Results(campaign, path) as results:
         if not results.complete:

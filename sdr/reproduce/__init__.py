@@ -17,6 +17,7 @@ __all__ = [
     "clopper_pearson",
     "format_table",
     "new_figure",
+    "reproduce",
     "row",
     "save_figure",
     "within",
@@ -24,6 +25,7 @@ __all__ = [
 ]
 
 EXPERIMENTS = {
+    "ouzeau2008": "sdr.reproduce.ouzeau",
     "abdelhafez-als": "sdr.reproduce.als",
     "abdelhafez-bias": "sdr.reproduce.bias",
     "vanek1999": "sdr.reproduce.vanek",
@@ -94,3 +96,16 @@ def new_figure(rows: int, columns: int, size=(9.0, 6.0), **options):
     figure = Figure(figsize=size, layout="constrained")
     FigureCanvasAgg(figure)
     return figure, figure.subplots(rows, columns, **options)
+
+
+def reproduce(name: str, out_dir: str | Path | None = None, quick: bool = False, seed: int = 1) -> dict:
+    """Run one of EXPERIMENTS; returns ``items`` (the rows), the directory and the table as text."""
+    import importlib
+
+    if name not in EXPERIMENTS:
+        raise ValueError(f"reproduction '{name}' is not known; allowed: {', '.join(sorted(EXPERIMENTS))}")
+    out = Path(out_dir) if out_dir is not None else Path(name)
+    rows = importlib.import_module(EXPERIMENTS[name]).run(out, quick=quick, seed=seed)
+    count = {v: sum(r["verdict"] == v for r in rows) for v in VERDICTS}
+    summary = ", ".join(f"{n} {v}" for v, n in count.items())
+    return {"items": rows, "output": str(out), "text": f"{format_table(rows)}\n{summary}; figures and tables in {out}"}
