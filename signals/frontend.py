@@ -239,7 +239,7 @@ class FrontEnd:
             iq = np.concatenate([iq, np.zeros((2, ahead), np.float32)], axis=1)
         x = np.concatenate([self._past, iq], axis=1)
         self._past = x[:, x.shape[1] - self._past.shape[1] :].copy()
-        out = np.empty(iq.shape, np.float32)
+        out = np.empty((2, iq.shape[1]), np.float32)
         fir(x[0], x[1], self._taps[0], self._taps[1], out[0], out[1])
         drop = min(self._skip, out.shape[1])
         self._skip -= drop

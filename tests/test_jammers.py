@@ -238,6 +238,9 @@ def test_line_of_the_received_code_meets_the_correlator(signal, prn, fs_hz):
     assert seen == pytest.approx(10 ** ((js_db + level_db[best]) / 20), rel=0.06)
     exact = abs(np.mean(np.exp(2j * np.pi * freq_hz[best] / 1.023e6 * chips) * replica))
     assert seen == pytest.approx(10 ** (js_db / 20) * exact, rel=1e-3)
+    # The samples turn at the frequency of the truth: a line that ignored the code's Doppler would be 0.35 Hz off.
+    turns = np.unwrap(np.angle(iq[0] + 1j * iq[1].astype(float))) / (2 * np.pi)
+    assert (turns[-1] - turns[0]) / (n - 1) * fs_hz == pytest.approx(run.freq_hz(0.11)[0], abs=0.01)
     assert run.freq_hz(0.1)[0] == pytest.approx(freq_hz[best] * (1 + 2345.53 / F_L1_HZ) + 2345.53, abs=0.01)
 
 
