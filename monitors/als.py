@@ -369,11 +369,17 @@ class Als(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
     kind: Literal["als"] = "als"
     n_lags: int = Field(2, ge=1, le=20)
+    """Lags of the innovations' autocovariance that are fitted, N."""
     window_epochs: int = Field(500, ge=20, le=100_000)
+    """Navigation epochs in one estimate."""
     settle_epochs: int = Field(100, ge=0, le=100_000)
+    """Epochs left out after the start and after each retuning."""
     full: bool = False
+    """Estimate a full R instead of a diagonal one."""
     joint_q: bool = False
+    """Estimate the scale of the process noise too."""
     retune_p: bool = True
+    """Restart the filter's covariance when R is retuned."""
 
     def start(self, rows: np.ndarray | None = None) -> "AlsRun":
         """Start on the measurement rows whose noise is to be estimated (range, rate, or both; default all used)."""

@@ -93,6 +93,7 @@ class Cn0Drop(_Spec):
 
     kind: Literal["CN0"] = "CN0"
     window_s: float = Field(1.0, gt=0)
+    """Length of the window over which C/N0 is measured."""
 
     def start(self, taps_chips, integration_s, signal="L1CA", prn=1, waveform=None):
         """-> Run."""
@@ -117,7 +118,9 @@ class NoiseFloor(_Spec):
 
     kind: Literal["NOISE_FLOOR"] = "NOISE_FLOOR"
     window_s: float = Field(1.0, gt=0)
+    """Length of the window over which the power is averaged."""
     beyond_chips: float = Field(2.0, ge=0)
+    """Taps further out than this count as noise floor."""
 
     def start(self, taps_chips, integration_s, signal="L1CA", prn=1, waveform=None):
         """-> Run."""
@@ -143,8 +146,11 @@ class SignalQuality(_Spec):
 
     kind: Literal["SQM"] = "SQM"
     metric: Literal["delta", "ratio"] = "delta"
+    """"delta": (E - L) / 2P, or "ratio": (E + L) / 2P."""
     offset_chips: float = Field(0.65, gt=0)
+    """Taps nearest to plus and minus this offset are used."""
     window_s: float = Field(1.0, gt=0)
+    """Length of the window over which the metric is averaged."""
 
     def start(self, taps_chips, integration_s, signal="L1CA", prn=1, waveform=None):
         """-> Run."""

@@ -190,10 +190,15 @@ class BiasBank(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
     kind: Literal["bias_bank"] = "bias_bank"
     grid_m: tuple[float, ...] = (-10.0, -5.0, 0.0, 5.0, 10.0)
+    """Biases hypothesised on each satellite."""
     floor: float = Field(1e-6, gt=0, lt=0.01)
+    """Probability below which no hypothesis may fall, so that it can come back."""
     declare: float = Field(0.99, gt=0.5, lt=1)
+    """A bias is declared when its probability exceeds this."""
     fit_epochs: int = Field(10, ge=1, le=1000)
+    """Epochs of the goodness-of-fit test."""
     fit_p_false: float = Field(1e-4, gt=0, lt=0.5)
+    """False-alarm probability of the goodness-of-fit test."""
 
     @field_validator("grid_m")
     @classmethod

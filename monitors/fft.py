@@ -92,8 +92,10 @@ class FftMonitor(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
     kind: Literal["FFT"] = "FFT"
     input: Literal["I", "IQ"] = "IQ"
+    """Transform the in-phase taps alone, or both components."""
     n_fft: int | None = Field(None, ge=2, le=4096)  # None: the number of taps
     window: Literal["none", "hann"] = "none"
+    """Window over the taps."""
 
     def start(self, taps_chips, integration_s, signal="L1CA", prn=1, waveform=None):
         """-> FftRun. Needs an odd number of equally spaced taps about zero."""

@@ -105,7 +105,9 @@ class GlrtMonitor(BaseModel):
     guard_chips: tuple[float, ...] | None = None  # delays projected out; None: those of the interference note
     grid_hz: float = Field(15e3, gt=0)  # taps that span D chips resolve about fc / D
     max_hz: float = Field(1.023e6, gt=0, le=4e6)
+    """Largest code-line frequency that is tested."""
     accumulate_epochs: int = Field(1, ge=1, le=100_000)
+    """Epochs summed without phase, M."""
     noise_variance: float | None = Field(None, gt=0)  # per component; None: from training
 
     def start(self, taps_chips, integration_s, signal="L1CA", prn=1, waveform=None):

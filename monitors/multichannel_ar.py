@@ -121,11 +121,17 @@ class MultichannelAr(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
     kind: Literal["AR"] = "AR"
     order: int = Field(1, ge=1, le=8)
+    """Order p of the autoregressive model."""
     window_s: float = Field(3.0, gt=0, le=100)
+    """Length of the window whose residual is compared."""
     hop_s: float = Field(0.5, gt=0, le=100)
+    """Step of the window."""
     form: Literal["refit", "fixed", "whitened"] = "whitened"
+    """Which residual energy: of a new fit, of the trained model, or of it whitened."""
     method: Literal["nuttall_strand", "vieira_morf"] = "nuttall_strand"
+    """Algorithm of the fit."""
     input: Literal["I", "IQ"] = "IQ"
+    """Model the in-phase taps alone, or both components."""
     wipe_sign: bool = True  # multiply each vector by the sign of its prompt: removes data signs
 
     def start(self, taps_chips, integration_s, signal="L1CA", prn=1, waveform=None):

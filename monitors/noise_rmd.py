@@ -64,12 +64,19 @@ class NoiseRmd(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
     kind: Literal["noise_rmd"] = "noise_rmd"
     window: int = Field(50, ge=2, le=100_000)
+    """Measurements per variance estimate."""
     scheme: Literal["printed", "unbiased", "age_weighted"] = "unbiased"
+    """Weights of the estimate: as printed in the source, unbiased, or by age."""
     pairing: Literal["interleaved", "two_channel"] = "interleaved"
+    """Where the redundant measurement comes from: every other epoch, or two channels."""
     age_half_life: float = Field(10.0, gt=0, description="samples, for age_weighted")
+    """Measurements after which a weight is halved (scheme "age_weighted")."""
     r0_m2: float = Field(0.0, ge=0)
+    """Variance assumed besides the estimated one."""
     adaptive_short: int = Field(0, ge=0, le=1000, description="samples of the short window; 0 = R0 fixed")
+    """Length of the short window that takes over when the noise changes; unset: never."""
     adaptive_ratio: float = Field(2.5, gt=1)
+    """Ratio of short to long estimate from which the short one is believed."""
 
     @property
     def divisor(self) -> float:

@@ -292,20 +292,33 @@ class ParallelFilters(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
     kind: Literal["parallel_filters"] = "parallel_filters"
     scheme: Literal["leave_one_out", "sets_of_four"] = "leave_one_out"
+    """Which satellites each filter of the bank leaves out."""
     period_epochs: int = Field(18, ge=2, le=10_000)
+    """Life of a filter before it is started afresh."""
     staggered: int = Field(3, ge=1, le=12)
+    """Filters alive at a time, of different age."""
     window_epochs: int = Field(18, ge=1, le=10_000)
+    """Epochs summed into the test statistic."""
     threshold: float = Field(64.0, gt=0)
+    """Limit of the summed statistic."""
     short_window_epochs: int = Field(3, ge=1, le=1000)
+    """Epochs of the short sum, for sudden faults."""
     short_threshold: float = Field(math.inf, gt=0)
+    """Limit of the short sum; infinite: off."""
     r0_m2: float = Field(7.0 * FOOT_M**2, ge=0)
+    """Range variance that the bank assumes."""
     reset_to: Literal["oldest", "leading"] = "oldest"
+    """Whose state the main filter takes after a fault."""
     min_satellites: int = Field(3, ge=1, le=64)
+    """Fewer satellites than this are never left by an exclusion."""
     recertify_windows: int = Field(0, ge=0, le=1000)
+    """Quiet windows after which an excluded satellite returns; 0: never."""
     recertify_threshold: float = Field(
         34.8, gt=0, description="0.99 quantile of chi-square with 18 degrees of freedom"
     )
+    """Limit of the statistic that counts as quiet."""
     recertify_growth: float = Field(1.5, ge=1)
+    """How much the sensitivity factor may have grown since the exclusion."""
 
     def layout(self, m: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """(use, test, period, phase) of the filters for m satellite slots, filter 0 = navigation."""

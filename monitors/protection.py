@@ -33,9 +33,13 @@ class Protection(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
     kind: Literal["protection"] = "protection"
     p_hmi: float = Field(2e-7, gt=0, lt=1)
+    """Integrity risk per approach."""
     p_fault: float = Field(1e-4, gt=0, lt=1)
+    """Prior probability of a fault of one satellite per approach."""
     p_false_alarm: float = Field(1.6e-5, gt=0, lt=1)
+    """False-alarm probability of the residual test per epoch."""
     independent_epochs: int = Field(1, ge=1, le=100_000)
+    """Independent epochs in one approach."""
 
 
 @dataclass(frozen=True)

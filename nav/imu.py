@@ -59,25 +59,33 @@ class ImuSpec(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     grade: Literal["ideal", "navigation", "tactical", "consumer", "karaim2020"] = "tactical"
+    """Quality class, which sets what the other keys leave unset."""
     rate_hz: Annotated[float, Field(ge=10, le=1000)] = 100.0
+    """Output rate."""
     gyro_bias_deg_h: Annotated[float, Field(ge=0)] = 0.0
     """Turn-on bias, standard deviation; constant through a run."""
     gyro_instability_deg_h: Annotated[float, Field(ge=0)] = 0.0
     """Standard deviation of the first-order Gauss-Markov part."""
     gyro_tau_s: Annotated[float, Field(gt=0)] = 3600.0
+    """Correlation time of the gyros' bias instability."""
     gyro_walk_deg_rth: Annotated[float, Field(ge=0)] = 0.0
     """Angular random walk (white rate noise)."""
     accel_bias_mg: Annotated[float, Field(ge=0)] = 0.0
+    """Turn-on bias of the accelerometers, one sigma."""
     accel_instability_mg: Annotated[float, Field(ge=0)] = 0.0
+    """Bias instability of the accelerometers."""
     accel_tau_s: Annotated[float, Field(gt=0)] = 3600.0
+    """Correlation time of that instability."""
     accel_walk_mps_rth: Annotated[float, Field(ge=0)] = 0.0
     """Velocity random walk (white specific-force noise)."""
     scale_ppm: Annotated[float, Field(ge=0, le=1e5)] = 0.0
     """Scale factor error of each axis, standard deviation, gyros and accelerometers."""
     misalignment_mrad: Annotated[float, Field(ge=0, le=100)] = 0.0
+    """Misalignment of the axes, one sigma."""
     gyro_lsb_rad: Annotated[float, Field(ge=0)] = 0.0
     """Quantum of an angle increment; 0: not quantised."""
     accel_lsb_mps: Annotated[float, Field(ge=0)] = 0.0
+    """Quantum of a velocity increment."""
     attitude: Literal["land", "aircraft"] = "land"
     """How the body is turned while it moves: along the track without roll, or as in coordinated turns."""
     heading_deg: Annotated[float, Field(ge=-360, le=360)] = 0.0
@@ -120,9 +128,13 @@ class OdometerSpec(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     rate_hz: Annotated[float, Field(ge=1, le=1000)] = 100.0
+    """Output rate."""
     noise_mps: Annotated[float, Field(ge=0, le=10)] = 0.01
+    """White noise of the speed, one sigma."""
     scale_sigma: Annotated[float, Field(ge=0, le=0.2)] = 0.01
+    """Standard deviation of the scale factor error."""
     scale_tau_s: Annotated[float, Field(gt=0)] = 3600.0
+    """Its correlation time."""
 
 
 def ecef17_of(imu: ImuSpec, **other) -> Ecef17:

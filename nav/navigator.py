@@ -40,9 +40,11 @@ class FilterSpec(BaseModel):
     accel_psd_m2_s3: Annotated[float, Field(gt=0)] = 1.0
     """White acceleration per ECEF axis: 1 lets a car turn; 0.01 suits a static antenna, 100 an aircraft."""
     clock_f_m2_s: Annotated[float, Field(ge=0)] = 0.009
+    """Spectral density of the clock's phase noise."""
     clock_g_m2_s3: Annotated[float, Field(ge=0)] = 0.035
     """Spectral densities of clock phase and frequency noise; the defaults are a TCXO's."""
     isb_psd_m2_s: Annotated[float, Field(ge=0)] = 1e-6
+    """Random walk of the inter-system bias."""
     gate_sigma: Annotated[float, Field(ge=3)] = 6.0
     """A range or rate whose innovation exceeds this many sigmas is left out."""
     coast_s: Annotated[float, Field(ge=0)] = 10.0
@@ -60,18 +62,31 @@ class NavigationSpec(BaseModel):
 
     kind: Literal["least_squares", "ekf"] = "least_squares"
     rate_hz: Annotated[float, Field(gt=0, le=50)] = 1.0
+    """Positions per second."""
     systems: Annotated[tuple[Literal["G", "E"], ...], Field(min_length=1, max_length=2)] = ("G", "E")
+    """Constellations that enter the position."""
     elevation_mask_deg: Annotated[float, Field(ge=0, lt=90)] = 5.0
+    """Satellites below this elevation are not used."""
     cn0_mask_dbhz: Annotated[float, Field(ge=0, le=60)] = 20.0
+    """Satellites weaker than this are not used."""
     gdop_max: Annotated[float, Field(gt=1)] = 30.0
+    """No position is given when the satellites stand closer together than this."""
     iono: Literal["klobuchar", "none"] = "klobuchar"
+    """Ionosphere correction."""
     tropo: Literal["saastamoinen", "none"] = "saastamoinen"
+    """Troposphere correction."""
     smoothing_s: Annotated[float | None, Field(ge=0, le=3600)] = None
+    """Window of the carrier smoothing (Hatch); unset: 100 s for least squares, none for the filter."""
     isb: Literal["estimate", "ggto"] = "estimate"
+    """How Galileo and GPS time are brought together: by an unknown, or by the broadcast offset."""
     use_unhealthy: bool = False
+    """Use satellites whose message says that they are unhealthy."""
     max_ephemeris_age_s: Annotated[float, Field(gt=0)] = 4 * 3600.0
+    """Ephemerides older than this are not used."""
     raim: bool = True
+    """Least squares leaves out satellites whose residuals do not fit."""
     raim_p_fa: Annotated[float, Field(gt=0, lt=1)] = 1e-5
+    """False-alarm probability of that test per epoch."""
     sigma_code_m: Annotated[float, Field(gt=0)] = 1.0
     """Code noise at 45 dB-Hz before smoothing."""
     sigma_atmosphere_m: Annotated[float, Field(gt=0)] = 0.3

@@ -55,25 +55,35 @@ class SteeringSpec(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     mode: Literal["scalar", "vector", "ultra_tight"] = "scalar"
+    """Channels on their own loops, steered by the position filter, or by it with an IMU."""
     model: Literal["kinematic", "riss_sf", "riss11", "ecef17"] | None = None
     """None: kinematic for vector, riss_sf for ultra_tight."""
     update_hz: Annotated[float, Field(ge=5, le=50)] = 50.0
+    """Rate at which the filter commands the channels."""
     compare: tuple[Literal["scalar", "vector", "ultra_tight"], ...] = ()
     """Run these receivers side by side on the same samples."""
     start_after_s: Annotated[float, Field(ge=0, le=3600)] = 2.0
     """Scalar fixes this long before the hand-over."""
     min_satellites: Annotated[int, Field(ge=4, le=24)] = 4
+    """Satellites needed to take the channels over."""
     heading_deg: Annotated[float | None, Field(ge=-360, le=360)] = None
     """Initial azimuth; None: from the velocity, once it is fast enough."""
     accel_psd_m2_s3: Annotated[float, Field(gt=0, le=1e4)] = 1.0
+    """White acceleration of the vector filter."""
     clock_phase_noise_m2_s: Annotated[float, Field(ge=0)] = 0.009
+    """Spectral density of the clock's phase noise."""
     clock_freq_noise_m2_s3: Annotated[float, Field(ge=0)] = 0.035
+    """Spectral density of the clock's frequency noise."""
     fast_cn0_s: Annotated[float, Field(ge=0.02, le=10)] = 0.1
+    """Time constant of the C/N0 that weighs measurements."""
     slow_cn0_s: Annotated[float, Field(ge=0.02, le=60)] = 1.0
+    """Time constant of the C/N0 it is compared with."""
     limit_sigma: Annotated[float, Field(ge=0)] = 4.0
     """Innovations beyond it are weighed down to it; 0: never."""
     code_floor_m: Annotated[float, Field(ge=0)] = 0.05
+    """Least standard deviation of a range."""
     rate_floor_mps: Annotated[float, Field(ge=0)] = 0.01
+    """Least standard deviation of a range rate."""
     range_sigma_m: Annotated[float, Field(gt=0)] = 3.0
     """Errors common to a satellite's ranges (orbit, atmosphere): a floor of the start covariance."""
     release_code_m: Annotated[float, Field(gt=0)] = 147.0

@@ -99,8 +99,11 @@ class Seeds(_Spec):
     """Roots of the three sets of trials; they must differ."""
 
     training: int = Field(1, ge=0, lt=2**63)
+    """Root seed of the training trials."""
     threshold: int = Field(2, ge=0, lt=2**63)
+    """Root seed of the threshold trials."""
     evaluation: int = Field(3, ge=0, lt=2**63)
+    """Root seed of the evaluated trials."""
 
     @model_validator(mode="after")
     def _check(self):
@@ -113,15 +116,19 @@ class Length(_Spec):
     """How many trials of how many integrations."""
 
     trials: int = Field(20, ge=1, le=100_000)
+    """Number of trials."""
     epochs: int = Field(20_000, ge=100, le=10_000_000)
+    """Integrations per trial."""
 
 
 class TrialSpec(_Spec):
     """One trial of the evaluation."""
 
     epochs: int = Field(25_000, ge=1, le=10_000_000)
+    """Integrations per trial."""
     settle_epochs: int = Field(500, ge=0, le=1_000_000)  # tracked, not tested; t = 0 is at their start
     smooth_s: float = Field(100.0, gt=0)
+    """Carrier smoothing of the range error."""
     hazard_m: float = Field(15.0, gt=0)  # on the smoothed range error
 
 
@@ -129,18 +136,23 @@ class StopSpec(_Spec):
     """When a point is finished: whichever comes first, in trial order."""
 
     max_trials: int = Field(20, ge=1, le=10_000_000)
+    """A point ends after so many trials."""
     errors: int | None = Field(None, ge=1)  # misses (quiet points: false alarms) of every monitor
     relative_error: float | None = Field(None, gt=0, lt=1)  # standard error / rate, of every monitor
     definition: Literal["hit", "all", "event", "hazard"] = "hit"
+    """Which misses count: with the line near (hit), all, per event, or hazardous ones."""
     min_trials: int = Field(2, ge=1)
+    """No point ends before so many trials."""
 
 
 class MonitorSpec(_Spec):
     """One monitor under test and the rule for its threshold."""
 
     name: str = Field(min_length=1, max_length=16, pattern=r"^[A-Za-z0-9_.-]+$")
+    """Name in the results."""
     detector: Detector
     rule: Literal["gaussian", "empirical", "pareto", "analytic"] = "pareto"
+    """How the threshold is found from the quiet statistics."""
     threshold: float | None = None  # given outright: no threshold set is run for it
 
     @model_validator(mode="after")
@@ -157,20 +169,29 @@ class CampaignSpec(_Spec):
     """A whole campaign file."""
 
     schema_: Annotated[int, Field(alias="schema", ge=1, le=1)] = 1
+    """Version of this file's layout."""
     name: str = Field(min_length=1, max_length=100)
+    """Name of the campaign and of its results file."""
     description: str = ""
+    """One sentence for lists."""
     loop: Literal["closed", "open"] = "closed"
+    """"closed": the twin tracks what it sees; "open": the replica follows the truth."""
     requirement: Literal["NPA", "APV-I", "APV-II"] = "APV-I"
+    """Aviation requirement whose probabilities hold where none is given."""
     p_fa: float | None = Field(None, gt=0, lt=0.5)  # per test (or approach); None: the requirement's
     p_fa_per: Literal["epoch", "approach"] = "epoch"
+    """Whether P_FA is meant per epoch or per approach."""
     channels: int = Field(8, ge=1, le=1000)  # tested in parallel, for p_fa_per = "approach"
     signal_dbw: float | None = None  # received power, for jammer.power_dbw
     dumps: int = Field(1, ge=1, le=1000)  # integrations of the loops per test
     seeds: Seeds = Seeds()
     twin: dict[str, Any]
+    """Base settings of the correlator-domain twin."""
     jammer: dict[str, Any] = {}
+    """The jammer (kind "CW" or "NBI") with its settings."""
     monitor: tuple[MonitorSpec, ...] = Field(min_length=1, max_length=32)
     grid: dict[str, Any] = {}
+    """Dotted key -> list of values; the points are all combinations."""
     trial: TrialSpec = TrialSpec()
     training: Length = Length()
     threshold: Length = Length(trials=40, epochs=25_000)

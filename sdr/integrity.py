@@ -79,6 +79,7 @@ class ChiSquare(BaseModel):
 
     model_config = _FROZEN
     p_false_alarm: float = Field(1e-6, gt=0, lt=0.5)
+    """False-alarm probability of one test."""
 
 
 class Limits(Protection):
@@ -86,7 +87,9 @@ class Limits(Protection):
 
     kind: Literal["protection"] = "protection"
     hal_m: float = Field(40.0, gt=0)
+    """Horizontal alert limit."""
     val_m: float = Field(50.0, gt=0)
+    """Vertical alert limit."""
 
 
 class IntegritySpec(BaseModel):
@@ -121,11 +124,17 @@ class RespondSpec(BaseModel):
 
     model_config = _FROZEN
     noise: Literal["als", "noise_rmd"] | None = None
+    """Range variances come from this estimator."""
     bias: bool = False
+    """Subtract a bias that was identified."""
     exclude: tuple[Literal["innovation", "raim", "parallel_filters"], ...] = ()
+    """Leave out satellites that these monitors accuse."""
     reset: bool = False
+    """Take the state of the parallel filter that never saw the fault."""
     fallback: bool = False
+    """Navigate by the other constellation when too many of one are faulty."""
     hold_s: float = Field(10.0, gt=0, le=3600)
+    """How long an action outlasts its cause."""
 
     @property
     def off(self) -> bool:

@@ -92,10 +92,15 @@ class Scenario(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     schema_: Annotated[int, Field(alias="schema", ge=SCHEMA, le=SCHEMA)] = SCHEMA
+    """Version of this file's layout."""
     name: Annotated[str, Field(min_length=1, max_length=100)]
+    """Name of the scenario and of its results file."""
     description: str = ""
+    """One sentence for lists."""
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 1
+    """Root of every random number; each part has a child of it."""
     duration_s: Annotated[float, Field(gt=0, le=86_400)]
+    """Length of the run."""
     sky: SkySpec = SkySpec()
     motion: Annotated[MotionSpec, Field(discriminator="kind")] = Static()
     clock: ClockSpec = ClockSpec()

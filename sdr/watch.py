@@ -58,16 +58,22 @@ class WatchSpec(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     name: str = Field(min_length=1, max_length=16, pattern=r"^[A-Za-z0-9_-]+$")
+    """Name in the results."""
     detector: Detector
     signals: tuple[Literal["L1CA", "E1B", "E1C"], ...] = ("L1CA", "E1B", "E1C")
+    """Channels that are watched."""
     p_fa: float = Field(1.6e-5, gt=0, lt=0.5)
+    """False-alarm probability that sets the threshold."""
     p_fa_per: Literal["epoch", "approach"] = "epoch"
+    """Whether it is meant per epoch or per approach."""
     approach_s: float = Field(150.0, gt=0)
+    """Length of an approach."""
     channels: int = Field(8, ge=1, le=100)  # tested in parallel, for p_fa_per = "approach"
     threshold: float | None = None  # given outright
     expect_multipath: MultipathSpec | None = None  # echoes that must not alarm
     settle_s: float = Field(3.0, ge=0)  # after lock, before training
     training_s: float = Field(20.0, gt=1, le=3600)
+    """Seconds of each channel that train its monitor."""
     gap_s: float = Field(1.0, ge=0)  # exceedances closer than this are one alarm
 
     def start(self, fs_hz: float) -> "Watch":

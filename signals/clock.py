@@ -42,10 +42,15 @@ class ClockSpec(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     bias_s: float = Field(default=0.0, ge=-0.1, le=0.1)
+    """Reading minus true time at the start."""
     drift_s_s: float = Field(default=0.0, ge=-1e-4, le=1e-4)
+    """Its rate; positive runs fast."""
     noise: Literal["none", "TCXO", "OCXO", "CSAC"] = "none"
+    """Oscillator class, which sets both noise coefficients."""
     h0_s: float | None = Field(default=None, ge=0.0, le=1e-15)
+    """White frequency noise, instead of the class's."""
     h_m2_hz: float | None = Field(default=None, ge=0.0, le=1e-15)
+    """Random-walk frequency noise, instead of the class's."""
     g_sensitivity_ned_per_g: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Fractional frequency per g of acceleration, along north, east, down of the place where the run begins."""
 

@@ -41,6 +41,7 @@ class _Fault(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     start_s: float = Field(0.0, ge=0, le=86_400)
+    """When it begins."""
     stop_s: float | None = Field(None, gt=0, le=86_400)
     """None: to the end of the scenario."""
 
@@ -74,8 +75,11 @@ class Step(_Fault):
 
     kind: Literal["Step"] = "Step"
     satellite: _SatId
+    """Name, e.g. "G05"."""
     step_m: float = Field(ge=-1e5, le=1e5)
+    """Size of the jump."""
     carrier: bool = False
+    """Whether the carrier jumps too."""
 
     def effect(self, age_s):
         """Constant code offset."""
@@ -87,8 +91,11 @@ class Ramp(_Fault):
 
     kind: Literal["Ramp"] = "Ramp"
     satellite: _SatId
+    """Name, e.g. "G05"."""
     rate_mps: float = Field(ge=-1e3, le=1e3)
+    """Drift of the range."""
     carrier: bool = False
+    """Whether the carrier drifts too."""
 
     def effect(self, age_s):
         """Code offset growing linearly."""
@@ -101,8 +108,11 @@ class CodeDelay(_Fault):
 
     kind: Literal["CodeDelay"] = "CodeDelay"
     satellite: _SatId
+    """Name, e.g. "G05"."""
     delay_m: float = Field(ge=-1e5, le=1e5)
+    """Delay of the code at last."""
     onset_s: float = Field(0.0, ge=0, le=3600)
+    """Time over which it builds up."""
 
     def effect(self, age_s):
         """A ramp of ``onset_s``, then constant."""
@@ -118,8 +128,11 @@ class ClockDrift(_Fault):
 
     kind: Literal["ClockDrift"] = "ClockDrift"
     satellite: _SatId
+    """Name, e.g. "G05"."""
     rate_mps: float = Field(0.0, ge=-1e3, le=1e3)
+    """Drift at the start."""
     accel_mps2: float = Field(0.0, ge=-100, le=100)
+    """Growth of the drift."""
 
     def effect(self, age_s):
         """A parabola in code and carrier."""
@@ -133,7 +146,9 @@ class PowerDrop(_Fault):
 
     kind: Literal["PowerDrop"] = "PowerDrop"
     satellite: _SatId | None = None
+    """Name, e.g. "G05"; unset: all."""
     drop_db: float = Field(gt=0, le=120)
+    """Loss of power."""
 
     def effect(self, age_s):
         """Level alone."""
@@ -150,13 +165,21 @@ class Spoofer(_Fault):
 
     kind: Literal["Spoofer"] = "Spoofer"
     satellite: _SatId
+    """Name, e.g. "G05"."""
     advantage_db: float = Field(3.0, ge=-30, le=40)
+    """Level over the genuine signal."""
     rise_s: float = Field(0.0, ge=0, le=3600)
+    """Time in which it gets there."""
     hold_s: float = Field(0.0, ge=0, le=3600)
+    """Time after the start at which it begins to draw away."""
     offset_m: float = Field(0.0, ge=-1e5, le=1e5)
+    """Range offset at first."""
     drift_mps: float = Field(2.0, ge=-1e3, le=1e3)
+    """Rate of the range offset afterwards."""
     phase_cycles: float = Field(0.0, ge=-1, le=1)
+    """Carrier phase against the genuine one."""
     doppler_hz: float = Field(0.0, ge=-1e4, le=1e4)
+    """Doppler against the genuine one."""
 
     def effect(self, age_s):
         """Offset of the counterfeit signal from the genuine one."""

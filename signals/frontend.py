@@ -37,11 +37,17 @@ class FilterSpec(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     bandwidth_hz: float = Field(gt=0.0, le=200e6)
+    """Two-sided bandwidth."""
     taps: int = Field(default=65, ge=9, le=1025)
+    """Length of the filter."""
     ripple_db: float = Field(default=0.0, ge=0.0, le=6.0)
+    """Amplitude ripple."""
     group_delay_ripple_s: float = Field(default=0.0, ge=-1e-6, le=1e-6)
+    """Ripple of the group delay."""
     ripples: float = Field(default=2.0, gt=0.0, le=20.0)
+    """Periods of the ripple across the band."""
     delay: Literal["removed", "kept"] = "removed"
+    """Whether the delay of the taps stays in the samples."""
 
     @model_validator(mode="after")
     def _odd(self):
@@ -72,6 +78,7 @@ class AgcSpec(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     time_constant_s: float = Field(default=1e-2, ge=1e-5, le=100.0)
+    """Time constant of the gain loop."""
 
 
 class SpurSpec(BaseModel):
@@ -79,7 +86,9 @@ class SpurSpec(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     freq_hz: float
+    """Offset from the carrier."""
     power_db: float = Field(ge=-100.0, le=40.0)
+    """Power over the thermal noise of the whole band."""
 
 
 class ImpairmentSpec(BaseModel):
@@ -92,11 +101,17 @@ class ImpairmentSpec(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     lo_offset_hz: float = Field(default=0.0, ge=-1e6, le=1e6)
+    """The oscillator is this much too high."""
     phase_noise_rad: float = Field(default=0.0, ge=0.0, le=3.0)
+    """Phase noise, rms."""
     phase_noise_bw_hz: float = Field(default=100.0, gt=0.0, le=1e3)
+    """Its corner frequency."""
     iq_gain_db: float = Field(default=0.0, ge=-10.0, le=10.0)
+    """Gain of Q over I."""
     iq_phase_deg: float = Field(default=0.0, ge=-45.0, le=45.0)
+    """Quadrature error."""
     dc: tuple[float, float] = (0.0, 0.0)
+    """Offset of I and Q in units of the noise."""
     spurs: tuple[SpurSpec, ...] = ()
 
 
@@ -110,10 +125,15 @@ class FrontEndSpec(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     fs_hz: float = Field(default=4.096e6, gt=0.0, le=200e6)
+    """Sample rate."""
     if_hz: float = Field(default=0.0, ge=-100e6, le=100e6)
+    """Intermediate frequency."""
     complex: bool = True
+    """I/Q samples, or real ones."""
     bits: Literal[1, 2, 3, 4, 5, 6, 7, 8, 16, 32] = 8
+    """Bits of a sample component; 32: float."""
     rms_lsb: float | None = Field(default=None, gt=0.1, le=10_000.0)
+    """Noise level in steps of the converter (8 and 16 bits)."""
     filter: FilterSpec | None = None
     agc: AgcSpec | None = None
     impairments: ImpairmentSpec | None = None

@@ -62,12 +62,19 @@ class CodeLine(BaseModel):
 
     model_config = _FROZEN
     signal: Literal["L1CA", "E1B", "E1C"]
+    """Signal whose code line is hit."""
     prn: int = Field(ge=1, le=63)
+    """Satellite whose code line is hit."""
     line: Literal["worst"] | int = "worst"
+    """The strongest line, or its index."""
     waveform: Literal["BPSK", "BOC11", "CBOC+", "CBOC-"] | None = None
+    """Waveform that decides which line is strongest; unset: as transmitted."""
     offset_hz: float = Field(0.0, ge=-5e6, le=5e6)
+    """Distance from the line."""
     rate_hz_s: float = Field(0.0, ge=-1e6, le=1e6)
+    """Rate of that distance."""
     follow_doppler: bool = True
+    """Follow the line as it is received."""
 
     def freq_hz(self, code_path=None) -> float:
         """k f_R; ValueError if the code has no such line."""
@@ -90,17 +97,28 @@ class _Jammer(BaseModel):
 
     model_config = _FROZEN
     js_db: float | None = Field(None, ge=-60.0, le=120.0)
+    """Power over that of a satellite."""
     against: str | None = Field(None, pattern=r"^[GE]\d\d$")
+    """Which satellite, e.g. "G05"; unset: the strongest."""
     power_dbw: float | None = Field(None, ge=-250.0, le=-50.0)
+    """Power at the antenna port, instead of js_db."""
     jn0_dbhz: float | None = Field(None, ge=-20.0, le=160.0)
+    """Power over the noise density, instead of js_db."""
     n0_dbw_hz: float = Field(-203.0, ge=-215.0, le=-180.0)
+    """Noise density that power_dbw is compared with, dBW/Hz."""
     start_s: float = Field(0.0, ge=0.0)
+    """When it is switched on."""
     stop_s: float | None = Field(None, gt=0.0)
+    """When it is switched off; unset: never."""
     profile: tuple[tuple[float, float], ...] = ()
+    """Pairs of time (s) and dB added to the power, linear between."""
     freq_hz: float = Field(0.0, ge=-50e6, le=50e6)
+    """Centre, offset from the carrier."""
     rate_hz_s: float = Field(0.0, ge=-1e9, le=1e9)
+    """Rate of the centre."""
     line: CodeLine | None = None
     phase_rad: float | None = None
+    """Phase at the start; unset: random."""
 
     @model_validator(mode="after")
     def _power_and_times(self):
@@ -211,8 +229,11 @@ class Chirp(_Jammer):
 
     kind: Literal["Chirp"] = "Chirp"
     sweep_hz: float = Field(gt=0.0, le=100e6)
+    """Width of the sweep."""
     sweep_s: float = Field(ge=1e-6, le=10.0)
+    """Time of one sweep."""
     shape: Literal["sawtooth", "triangular"] = "sawtooth"
+    """Up and again, or up and down."""
 
     @property
     def width_hz(self):
@@ -233,10 +254,15 @@ class Pulsed(_Jammer):
 
     kind: Literal["Pulsed"] = "Pulsed"
     rate_hz: float = Field(gt=0.0, le=1e5)
+    """Pulses (DME: pairs) per second."""
     shape: Literal["rectangular", "dme"] = "rectangular"
+    """Rectangles, or DME pairs."""
     duty: float | None = Field(None, gt=0.0, lt=1.0)
+    """Part of the time that a rectangle fills."""
     pair_spacing_s: float = Field(12e-6, ge=0.0, le=1e-3)
+    """Distance of the two pulses of a DME pair."""
     random: bool = False
+    """Place each pulse at random in its slot."""
 
     @model_validator(mode="after")
     def _fits(self):
@@ -286,6 +312,7 @@ class Narrowband(_Jammer):
 
     kind: Literal["Narrowband"] = "Narrowband"
     bandwidth_hz: float = Field(gt=0.01, le=100e6)
+    """Two-sided bandwidth."""
 
     @property
     def width_hz(self):
@@ -349,6 +376,7 @@ class MatchedSpectrum(_Jammer):
 
     kind: Literal["MatchedSpectrum"] = "MatchedSpectrum"
     waveform: Literal["BPSK", "BOC11"] = "BPSK"
+    """Waveform of the random code."""
 
     @property
     def width_hz(self):
@@ -381,8 +409,11 @@ class Interferer(_Jammer):
 
     kind: Literal["Interferer"] = "Interferer"
     path: str = Field(min_length=1)
+    """Recording to add; it needs the scenario's sample rate."""
     repeat: bool = True
+    """Begin anew after its end."""
     power_window_s: float = Field(1.0, gt=0.0, le=60.0)
+    """Length over which its power is measured."""
 
     def wave(self, fs_hz, seed, context):
         """See `_Jammer.wave`."""

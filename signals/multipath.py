@@ -79,9 +79,13 @@ class Echo(_Spec):
     """
 
     delay_s: float = Field(ge=0, le=1e-3)
+    """Excess delay at the start."""
     delay_rate_s_s: float = Field(0.0, ge=-1e-5, le=1e-5)
+    """Its rate."""
     power_db: float = Field(ge=-100, le=20)
+    """Power relative to the direct signal."""
     doppler_hz: float = Field(0.0, ge=-1e4, le=1e4)
+    """Doppler relative to the direct signal."""
     phase_rad: float | None = None  # None: drawn per trial
     bandwidth_hz: float = Field(0.0, ge=0, le=1e4)  # Doppler spread, flat over +-B/2; 0: no fading
 
@@ -111,6 +115,7 @@ class Aeronautical(_Spec):
     satellites: tuple[_SatId, ...] | None = None
     """Those that have echoes; None: all."""
     elevation_deg: float = Field(10.0, gt=0, le=90)
+    """Elevation of the satellite."""
     fuselage_power_db: float | None = Field(-14.2, ge=-100, le=0)  # None: no fuselage echo
     fuselage_delay_s: float = Field(1.5e-9, ge=0, le=1e-7)  # assumed within the sourced 1 to 2 ns
     fuselage_bandwidth_hz: float = Field(0.1, gt=0, le=1e3)  # assumed
@@ -123,6 +128,7 @@ class Aeronautical(_Spec):
     sink_rate_mps: float = Field(3.0, ge=0, le=100)  # assumed
     visible_s: float = Field(0.0, ge=0)  # assumed: mean dwell of the ground echo; 0: always there
     hidden_s: float = Field(0.0, ge=0)
+    """Time for which the direct signal is hidden."""
 
     @model_validator(mode="after")
     def _check(self):

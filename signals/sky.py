@@ -38,10 +38,15 @@ class ScriptedSpec(Range):
 
     model_config = _FROZEN
     signal: Literal["L1CA", "E1"] = "L1CA"
+    """Signal that it transmits."""
     prn: int = Field(ge=1, le=63)
+    """Satellite number."""
     cn0_dbhz: float | None = Field(default=None, ge=0.0, le=80.0)
+    """C/N0; unset: the sky's."""
     elevation_deg: float = Field(default=45.0, ge=0.0, le=90.0)
+    """Elevation in the truth."""
     azimuth_deg: float = Field(default=0.0, ge=0.0, le=360.0)
+    """Azimuth in the truth."""
 
 
 class SatelliteSpec(BaseModel):
@@ -49,9 +54,13 @@ class SatelliteSpec(BaseModel):
 
     model_config = _FROZEN
     system: Literal["G", "E"]
+    """Constellation."""
     prn: int = Field(ge=1, le=63)
+    """Satellite number."""
     cn0_dbhz: float | None = Field(default=None, ge=0.0, le=80.0)
+    """C/N0 of this satellite; unset: the sky's."""
     health: int | None = Field(default=None, ge=0, le=63)
+    """Health in its message; unset: healthy."""
 
 
 @dataclass(frozen=True)
@@ -95,20 +104,33 @@ class SkySpec(BaseModel):
 
     model_config = _FROZEN
     start_time: datetime = Field(default=datetime(2024, 3, 1, 12, 0, 0), alias="start")
+    """GPS time of the first sample, a whole second, without zone or leap seconds."""
     source: Literal["nominal", "rinex", "none"] = "nominal"
+    """Built-in nominal constellations, a RINEX navigation file, or none."""
     path: str | None = None
+    """RINEX navigation file (source "rinex")."""
     signals: tuple[Literal["L1CA", "E1"], ...] = ("L1CA", "E1")
+    """Signals in the air."""
     elevation_mask_deg: float = Field(default=5.0, ge=0.0, lt=90.0)
+    """Satellites below this elevation are left out."""
     max_satellites: int | None = Field(default=None, ge=1, le=128)
+    """The highest so many are taken; unset: all."""
     prns: tuple[_SatId, ...] | None = None
+    """Only these satellites, e.g. ["G05", "E11"]; unset: all."""
     unhealthy: tuple[_SatId, ...] = ()
+    """Satellites whose message says unhealthy."""
     cn0_dbhz: float = Field(default=45.0, ge=0.0, le=80.0)
+    """C/N0 of the whole signal at the antenna port."""
     cn0_model: Literal["constant", "elevation"] = "constant"
+    """The same for all, or falling with elevation."""
     cn0_drop_db: float = Field(default=10.0, ge=0.0, le=40.0)
+    """Loss at the horizon (cn0_model "elevation")."""
     satellite: tuple[SatelliteSpec, ...] = ()
     scripted: tuple[ScriptedSpec, ...] = ()
     ionosphere: Literal["klobuchar", "none"] = "klobuchar"
+    """Ionosphere of the truth."""
     troposphere: Literal["saastamoinen", "none"] = "saastamoinen"
+    """Troposphere of the truth."""
 
     @field_validator("start_time")
     @classmethod

@@ -60,8 +60,11 @@ class _Place(BaseModel):
 
     model_config = _FROZEN
     lat_deg: float = Field(default=48.0, ge=-90.0, le=90.0)
+    """Latitude of the anchor."""
     lon_deg: float = Field(default=11.0, ge=-180.0, le=360.0)
+    """Longitude of the anchor."""
     height_m: float = Field(default=500.0, ge=-500.0, le=100_000.0)
+    """Height of the anchor above the WGS 84 ellipsoid."""
 
     def anchor(self) -> tuple[np.ndarray, np.ndarray]:
         """ECEF position (3,) and rotation C_ne (3, 3), ECEF to north-east-down, of the anchor."""
@@ -104,7 +107,9 @@ class Line(_Place):
 
     kind: Literal["Line"] = "Line"
     vel_ned_mps: _Vector = (0.0, 0.0, 0.0)
+    """Velocity at the start."""
     acc_ned_mps2: _Vector = (0.0, 0.0, 0.0)
+    """Constant acceleration."""
 
     def start(self, duration_s: float | None = None) -> Motion:
         """Run of the motion; any duration."""
@@ -122,8 +127,11 @@ class Circle(_Place):
 
     kind: Literal["Circle"] = "Circle"
     radius_m: float = Field(default=500.0, gt=0.0, le=1e6)
+    """Radius."""
     speed_mps: float = Field(default=20.0, ge=-5_000.0, le=5_000.0)
+    """Speed; negative: counter-clockwise."""
     start_azimuth_deg: float = Field(default=0.0, ge=-360.0, le=360.0)
+    """Where on the circle it begins."""
 
     def start(self, duration_s: float | None = None) -> Motion:
         """Run of the motion; any duration."""
@@ -147,9 +155,13 @@ class Approach(_Place):
 
     kind: Literal["Approach"] = "Approach"
     course_deg: float = Field(default=90.0, ge=-360.0, le=360.0)
+    """Course over ground."""
     glide_deg: float = Field(default=3.0, gt=0.0, le=20.0)
+    """Glide angle."""
     ground_speed_mps: float = Field(default=57.3, gt=0.0, le=300.0)
+    """Speed over ground."""
     start_height_m: float = Field(default=914.0, gt=0.0, le=10_000.0)
+    """Height above the threshold at the start."""
 
     def start(self, duration_s: float | None = None) -> Motion:
         """Run of the motion; refused where it would go below the threshold."""
@@ -181,8 +193,11 @@ class HighDynamics(_Place):
     kind: Literal["HighDynamics"] = "HighDynamics"
     height_m: float = Field(default=5_000.0, ge=-500.0, le=100_000.0)
     acc_ned_mps2: _Vector = (10.0, 8.0, 5.0)
+    """Amplitudes north, east, down."""
     period_s: tuple[_Period, _Period, _Period] = (20.0, 14.0, 9.0)
+    """Periods north, east, down."""
     vel_ned_mps: _Vector = (150.0, 0.0, 0.0)
+    """Mean velocity."""
 
     def start(self, duration_s: float | None = None) -> Motion:
         """Run of the motion; any duration."""
@@ -209,10 +224,15 @@ class Segment(BaseModel):
 
     model_config = _FROZEN
     duration_s: float = Field(gt=0.0, le=86_400.0)
+    """Length of the segment."""
     speed_mps: float | None = Field(default=None, ge=0.0, le=3_000.0)
+    """Ground speed at its end; unset: it stays."""
     acceleration_mps2: float | None = Field(default=None, ge=-500.0, le=500.0)
+    """Mean acceleration, instead of a speed."""
     climb_mps: float | None = Field(default=None, ge=-1_000.0, le=1_000.0)
+    """Vertical speed at its end; unset: it stays."""
     turn_rate_deg_s: float = Field(default=0.0, ge=-360.0, le=360.0)
+    """Mean turn rate, clockwise."""
 
     @model_validator(mode="after")
     def _one_way(self):
@@ -231,9 +251,13 @@ class Segments(_Place):
 
     kind: Literal["Segments"] = "Segments"
     heading_deg: float = Field(default=0.0, ge=-360.0, le=360.0)
+    """Heading at the start, clockwise from north."""
     speed_mps: float = Field(default=0.0, ge=0.0, le=3_000.0)
+    """Ground speed at the start."""
     climb_mps: float = Field(default=0.0, ge=-1_000.0, le=1_000.0)
+    """Vertical speed at the start."""
     ramp_s: float = Field(default=2.0, gt=0.0, le=60.0)
+    """How long a rate takes to build up within a segment."""
     segment: tuple[Segment, ...] = Field(min_length=1, max_length=10_000)
 
     def start(self, duration_s: float | None = None) -> Motion:
@@ -393,9 +417,13 @@ class Recorded(BaseModel):
     model_config = _FROZEN
     kind: Literal["Recorded"] = "Recorded"
     path: str = Field(min_length=1)
+    """File with the track."""
     skip_s: float = Field(default=0.0, ge=0.0)
+    """Leave out the first seconds of the track."""
     max_speed_mps: float = Field(default=600.0, gt=0.0, le=20_000.0)
+    """A faster track is refused."""
     max_acceleration_mps2: float = Field(default=200.0, gt=0.0, le=5_000.0)
+    """A rougher track is refused."""
 
     def start(self, duration_s: float | None = None) -> Motion:
         """Read and check the file; refused where the track jumps, repeats a time or ends before the run."""
@@ -566,11 +594,17 @@ class Range(BaseModel):
 
     model_config = _FROZEN
     delay_s: float = Field(default=0.075, ge=0.0, le=10.0)
+    """Delay at the start."""
     doppler_hz: float | Literal["random"] = 0.0
+    """Doppler at the start, or "random"."""
     max_doppler_hz: float = Field(default=10e3, ge=0.0, le=50e3)
+    """Range of the random Doppler."""
     doppler_rate_hz_s: float = Field(default=0.0, ge=-2_000.0, le=2_000.0)
+    """Its rate."""
     manoeuvre: Literal["none", "normal", "abnormal"] = "none"
+    """How strongly the receiver manoeuvres along the line of sight."""
     profile: Literal["bounded", "cubic"] = "bounded"
+    """Manoeuvres that stay within a speed, or the paper's cubic."""
 
     @model_validator(mode="after")
     def _doppler_allowed(self):

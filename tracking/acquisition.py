@@ -64,8 +64,11 @@ class AcquisitionSpec(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     systems: tuple[Literal["G", "E"], ...] = ("G", "E")
+    """Constellations that are searched."""
     gps_prns: tuple[int, ...] = tuple(range(1, 33))
+    """GPS satellites that are searched."""
     galileo_prns: tuple[int, ...] = tuple(range(1, 37))
+    """Galileo satellites that are searched."""
     doppler_range_hz: float = Field(default=5000.0, gt=0, le=100e3)
     """Half width of the search."""
     doppler_center_hz: float = Field(default=0.0, ge=-100e3, le=100e3)
@@ -81,6 +84,7 @@ class AcquisitionSpec(BaseModel):
     excise_tones: bool = True
     """Leave out spectral lines that stand 12 dB above their surroundings: two tones can pass for a satellite."""
     workers: int = Field(default=1, ge=1, le=64)
+    """Threads of the search; the results do not depend on it."""
 
     @model_validator(mode="after")
     def _known_prns(self):

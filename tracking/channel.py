@@ -45,7 +45,9 @@ class TapsSpec(BaseModel):
 
     model_config = _FROZEN
     count: int = Field(ge=1, le=255)
+    """Number of taps, odd."""
     spacing_chips: float = Field(gt=0.0, le=10.0)
+    """Distance between taps."""
 
     @field_validator("count")
     @classmethod
@@ -60,14 +62,21 @@ class _Loops(BaseModel):
 
     model_config = _FROZEN
     pll_order: Literal[2, 3] = 3
+    """Order of the carrier loop."""
     pll_bw_hz: float = Field(10.0, gt=0.0, le=300.0)
+    """Noise bandwidth of the carrier loop, one-sided."""
     dll_order: Literal[1, 2] = 1
+    """Order of the code loop, which the carrier aids."""
     dll_bw_hz: float = Field(1.0, gt=0.0, le=50.0)
+    """Noise bandwidth of the code loop, one-sided."""
     fll_bw_hz: float = Field(0.0, ge=0.0, le=50.0)
+    """Noise bandwidth of the frequency aid; 0: none."""
     code_discriminator: Literal["envelope", "power", "dot_product", "coherent", "very_early_late"] = (
         "envelope"
     )
+    """Code discriminator."""
     taps: TapsSpec | None = None
+    """Window of additional correlator taps; unset: E, P, L alone."""
 
     def _check(self, T_s):
         pll_gains(self.pll_order, self.pll_bw_hz, T_s)
@@ -79,8 +88,11 @@ class L1caTracking(_Loops):
     """GPS L1 C/A channels. ``early_late_space_chips`` is the whole spacing between E and L."""
 
     integration_ms: Literal[1, 2, 4, 5, 10, 20] = 20
+    """Coherent integration after bit synchronisation."""
     early_late_space_chips: float = Field(0.5, gt=0.0, lt=2.0)
+    """Whole spacing between early and late."""
     carrier_discriminator: Literal["costas_atan", "costas_product"] = "costas_atan"
+    """Phase discriminator, insensitive to data."""
 
     @model_validator(mode="after")
     def _stable(self):
@@ -96,11 +108,17 @@ class E1Tracking(_Loops):
     """
 
     component: Literal["pilot", "data"] = "pilot"
+    """The pilot E1-C carries the loops, or the data E1-B alone."""
     integration_ms: int = Field(20, ge=4, le=100)
+    """Coherent integration."""
     early_late_space_chips: float = Field(0.25, gt=0.0, lt=0.6)
+    """Whole spacing between early and late."""
     very_early_late_space_chips: float = Field(1.0, ge=0.8, le=1.2)
+    """Whole spacing between very early and very late."""
     replica: Literal["BOC11", "CBOC"] = "BOC11"
+    """Waveform of the replica."""
     side_peak_protection: bool = True
+    """Jump back when a side peak of the BOC correlation is tracked."""
 
     @model_validator(mode="after")
     def _stable(self):
@@ -128,17 +146,29 @@ class TrackingSpec(BaseModel):
     l1ca: L1caTracking = L1caTracking()
     e1: E1Tracking = E1Tracking()
     cn0_window_s: float = Field(1.0, ge=0.05, le=30.0)
+    """Window of the C/N0 estimators."""
     cn0_min_dbhz: float = Field(22.0, ge=0.0, le=60.0)
+    """A channel weaker than this is not locked."""
     lock_in: float = Field(0.7, gt=0.0, lt=1.0)
+    """Carrier-lock indicator from which a channel counts as locked."""
     lock_out: float = Field(0.4, gt=-1.0, lt=1.0)
+    """Carrier-lock indicator below which it no longer does."""
     lost_after_s: float = Field(1.0, gt=0.0, le=600.0)
+    """A channel without lock for this long is given up."""
     settle_s: float = Field(0.6, ge=0.2, le=10.0)
+    """Length of the pull-in."""
     pull_in_dll_bw_hz: float = Field(4.0, gt=0.0, le=20.0)
+    """Code loop before bit synchronisation."""
     settle_pll_bw_hz: float = Field(12.0, gt=0.0, le=15.0)
+    """Carrier loop while settling."""
     settle_fll_bw_hz: float = Field(2.0, ge=0.0, le=10.0)
+    """Frequency aid while settling."""
     settle_dll_bw_hz: float = Field(2.0, gt=0.0, le=10.0)
+    """Code loop while settling."""
     threads: int = Field(1, ge=1, le=64)
+    """Threads of the correlators; the results do not depend on it."""
     arithmetic: Literal["auto", "float"] = "auto"
+    """Integer correlation where possible, or single precision everywhere."""
 
     @model_validator(mode="after")
     def _hysteresis(self):

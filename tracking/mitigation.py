@@ -49,7 +49,9 @@ class Blanking(BaseModel):
     model_config = _FROZEN
     kind: Literal["Blanking"] = "Blanking"
     threshold_db: float = Field(10.0, ge=6.0, le=40.0)
+    """Power over the noise from which samples are zeroed."""
     guard: int = Field(2, ge=0, le=1000)
+    """Samples zeroed on either side too."""
 
     def start(self, source: Any) -> "Mitigated":
         """Source of the mitigated samples."""
@@ -75,7 +77,9 @@ class Excision(BaseModel):
     model_config = _FROZEN
     kind: Literal["Excision"] = "Excision"
     length: Literal[256, 512, 1024, 2048, 4096, 8192] = 1024
+    """Samples of a frame."""
     p_fa: float = Field(1e-2, gt=0.0, le=0.5)
+    """False-alarm probability per frame."""
 
     def start(self, source: Any) -> "Mitigated":
         """Source of the mitigated samples."""
@@ -106,8 +110,11 @@ class Notch(BaseModel):
     model_config = _FROZEN
     kind: Literal["Notch"] = "Notch"
     contraction: float = Field(0.98, ge=0.5, lt=1.0)
+    """Radius of the pole: nearer to 1 is narrower."""
     step: float = Field(2e-4, gt=0.0, le=0.1)
+    """Step of the adaptation."""
     engage: float = Field(0.8, gt=0.0, lt=1.0)
+    """Radius of the zero from which the notch cuts."""
 
     def start(self, source: Any) -> "Mitigated":
         """Source of the mitigated samples."""
@@ -155,8 +162,11 @@ class Cancellation(BaseModel):
     model_config = _FROZEN
     kind: Literal["Cancellation"] = "Cancellation"
     frame_ms: float = Field(10.0, ge=0.5, le=100.0)
+    """Length of a frame."""
     max_tones: int = Field(3, ge=1, le=20)
+    """Tones looked for in a frame."""
     p_fa: float = Field(1e-4, gt=0.0, le=0.1)
+    """Probability that a frame of noise alone has a tone."""
 
     def start(self, source: Any) -> "Mitigated":
         """Source of the mitigated samples."""
