@@ -1,5 +1,7 @@
 """The tracking kernel: correlator twin, closed loops against theory, synchronisation, robustness."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from naive_correlator import correlate, rounding_chips
@@ -252,7 +254,7 @@ def test_loop_filters_follow_their_equations(signal, order):
     k1, k2, k3 = loops.pll_gains(order, bw, T)
     c1, c2 = loops.dll_gains(2, dll_bw, T)
     e = e[e["sample_index"] >= st["start_sample"]]
-    for now, following in zip(e[:-1], e[1:]):
+    for now, following in pairwise(e):
         phase, code = float(now["phase_error_cycles"]), float(now["code_error_chips"])
         accel += k3 * phase / T**2
         rate += k2 * phase / T + accel * T

@@ -23,7 +23,7 @@ def _samples(out, n0, fs, if_hz, doppler, ramp, phase0, code0, data, pilot, symb
         t = n / fs
         cycles = doppler * t + 0.5 * ramp * t * t
         x = code0 + 1.023e6 * t + cycles / 1540.0
-        whole = int(math.floor(x))
+        whole = math.floor(x)
         chip = whole % length
         slot = int((x - whole) * slots)
         period = whole // length

@@ -161,7 +161,7 @@ class TrackingSpec(BaseModel):
     """Code loop before bit synchronisation."""
     settle_pll_bw_hz: float = Field(12.0, gt=0.0, le=15.0)
     """Carrier loop while settling."""
-    settle_fll_bw_hz: float = Field(2.0, ge=0.0, le=10.0)
+    settle_fll_bw_hz: float = Field(1.0, ge=0.0, le=10.0)
     """Frequency aid while settling."""
     settle_dll_bw_hz: float = Field(2.0, gt=0.0, le=10.0)
     """Code loop while settling."""
@@ -208,7 +208,7 @@ class Tracker:
         self._hist = np.zeros((0, HISTORY, 2))
         self._commands = np.zeros(0, AIDING)
         self._pool, self._tables = np.zeros(0, np.int8), {}
-        self._buffer, self._first, self._end = None, 0, None
+        self._buffer, self._first, self._end, self._begun = np.zeros((2, 0), np.int8), 0, 0, False
         self._secondary = np.asarray(secondary_code(), np.float64)
         self._threads = ThreadPoolExecutor(spec.threads) if spec.threads > 1 else None
 
@@ -227,7 +227,7 @@ class Tracker:
         st, offsets, n_window = self._describe(signal, prn)
         c = self._slot()
         self._place(c, st, offsets, n_window)
-        start = self._end if self._end is not None else int(acquisition["sample_index"])
+        start = self._end if self._begun else int(acquisition["sample_index"])
         doppler = float(acquisition["doppler_hz"])
         rate = CHIP_RATE_HZ * (1.0 + doppler / F_L1_HZ) / self.fs_hz
         phase = float(acquisition["code_phase_chips"]) + (start - int(acquisition["sample_index"])) * rate
@@ -483,14 +483,14 @@ class Tracker:
             raise ValueError(
                 f"a slab is a (2, n) array of int8, int16 or float32, not {iq.dtype} of shape {iq.shape}"
             )
-        if self._end is not None and n0 != self._end:
+        if self._begun and n0 != self._end:
             raise ValueError(
                 f"slab starts at sample {n0} where {self._end} was expected: slabs must not leave gaps"
             )
-        if self._end is None:
-            self._first = self._end = n0
+        if not self._begun:
+            self._first, self._end, self._begun = n0, n0, True
         left, n = self._end - self._first, iq.shape[1]
-        if self._buffer is None or self._buffer.dtype != iq.dtype or self._buffer.shape[1] < left + n:
+        if self._buffer.dtype != iq.dtype or self._buffer.shape[1] < left + n:
             fresh = np.zeros((2, left + n + int(0.01 * self.fs_hz)), iq.dtype)
             if left:
                 if self._buffer.dtype != iq.dtype:

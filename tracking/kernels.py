@@ -900,7 +900,7 @@ def _update_lock(st, noise, T_s, fs_hz, phase_error):
 
 @njit(nogil=True)
 def _false_frequency(st, i1, q1, i2, q2, T_s):
-    """A Costas loop also settles at multiples of 1 / (2 T): the halves of the integration show it; jump back.
+    """A Costas loop also settles at fractions and multiples of 1 / (2 T): the halves show it; jump back.
 
     The mean product of halves must hold 0.6 of what a noise-free signal at that alias gives, over 0.3 s.
     """
@@ -913,11 +913,10 @@ def _false_frequency(st, i1, q1, i2, q2, T_s):
     re, im, whole = st.half_i, st.half_q, st.half_p
     st.half_i = st.half_q = st.half_p = st.half_n = 0.0
     f = math.atan2(im, re) / (_TWO_PI * 0.5 * T_s)
-    if st.steered != 0 or abs(f) < 0.3 / T_s or math.hypot(re, im) < 0.3 * whole:
+    if st.steered != 0 or abs(f) < 0.15 / T_s or math.hypot(re, im) < 0.3 * whole:
         return False
     st.rate_hz += f
     st.doppler_hz = st.rate_hz
-    st.rate_hz_s = 0.0
     st.settling, st.stage, st.stage_time_s, st.marks = 1, 0, 0.0, 0
     _reset_moments(st)
     return True
@@ -1015,7 +1014,13 @@ def _finish(st, acc, hist, secondary, fs_hz, epoch, corr, symbols, count):
             code = 0
         code_err = code_error(code, ve, e, p, late, vl) * st.code_scale_chips + rounding
         slip = _update_lock(st, noise, T_s, fs_hz, phase_error)
-        if st.steered == 0 and st.state == STATE_LOCKED:
+        whole = st.m_total == (
+            st.m_settle if st.settling else st.m_track
+        )  # not one cut short to meet a bit edge
+        if st.steered == 0 and st.state == STATE_LOCKED and not whole:
+            st.rate_hz += st.rate_hz_s * T_s
+            st.doppler_hz = st.rate_hz
+        elif st.steered == 0 and st.state == STATE_LOCKED:
             _steer(st, phase_error, freq_error, code_err, T_s)
             _false_frequency(st, i1, q1, i2, q2, T_s)
             if st.bump_n * T_s >= 0.1 and st.bump_n >= 4.0 and _bump_decision(st, 1.5):

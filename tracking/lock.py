@@ -38,13 +38,12 @@ def cn0_noise_reference_dbhz(prompt_power, n_samples, sample_noise_power, n_nois
 
 @njit(cache=True)
 def cn0_moments_dbhz(m2, m4, n, T_s):
-    """C/N0 from the in-phase prompt alone: A^4 = (3 M2^2 - M4) / 2, noise variance M2 - A^2, C/N0 = A^2 / (2
-    T var).
+    """C/N0 = A^2 / (2 T v) from the in-phase prompt alone: A^4 = (3 M2^2 - M4) / 2, noise variance v = M2 - A^2.
 
     M2, M4: means of I^2 and I^4 over ``n`` integrations. For I = +-A + noise, M2 = A^2 + v and M4 = A^4 + 6
     A^2 v + 3 v^2, so the data sign does not matter (the real-valued form of Pauluzzi & Beaulieu, IEEE Trans.
-    Commun. 48(10), 2000, eq. 30). The factor (n - 3) / (n - 1) n / (n - 1) removes the bias of a ratio of
-    sample moments.
+    Commun. 48(10), 2000, eq. 30). The factor (n - 3) / n removes the bias of
+    the inverse of a sample variance.
     """
     a4 = 0.5 * (3.0 * m2 * m2 - m4)
     if a4 <= 0.0 or n < 5.0:
