@@ -74,7 +74,7 @@ class NoiseRmd(BaseModel):
     r0_m2: float = Field(0.0, ge=0)
     """Variance assumed besides the estimated one."""
     adaptive_short: int = Field(0, ge=0, le=1000, description="samples of the short window; 0 = R0 fixed")
-    """Length of the short window that takes over when the noise changes; unset: never."""
+    """Length of the short window that takes over when the noise changes; 0: never."""
     adaptive_ratio: float = Field(2.5, gt=1)
     """Ratio of short to long estimate from which the short one is believed."""
 

@@ -292,7 +292,7 @@ class ParallelFilters(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
     kind: Literal["parallel_filters"] = "parallel_filters"
     scheme: Literal["leave_one_out", "sets_of_four"] = "leave_one_out"
-    """Which satellites each filter of the bank leaves out."""
+    """Each filter leaves one satellite out, or uses a set of four."""
     period_epochs: int = Field(18, ge=2, le=10_000)
     """Life of a filter before it is started afresh."""
     staggered: int = Field(3, ge=1, le=12)

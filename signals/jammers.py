@@ -97,9 +97,9 @@ class _Jammer(BaseModel):
 
     model_config = _FROZEN
     js_db: float | None = Field(None, ge=-60.0, le=120.0)
-    """Power over that of a satellite."""
+    """Power over that of the satellite ``against`` at the moment the jammer starts."""
     against: str | None = Field(None, pattern=r"^[GE]\d\d$")
-    """Which satellite, e.g. "G05"; unset: the strongest."""
+    """The satellite that js_db refers to, e.g. "G05"."""
     power_dbw: float | None = Field(None, ge=-250.0, le=-50.0)
     """Power at the antenna port, instead of js_db."""
     jn0_dbhz: float | None = Field(None, ge=-20.0, le=160.0)

@@ -128,7 +128,7 @@ class Aeronautical(_Spec):
     sink_rate_mps: float = Field(3.0, ge=0, le=100)  # assumed
     visible_s: float = Field(0.0, ge=0)  # assumed: mean dwell of the ground echo; 0: always there
     hidden_s: float = Field(0.0, ge=0)
-    """Time for which the direct signal is hidden."""
+    """Mean time for which the echo is hidden, between mean times visible."""
 
     @model_validator(mode="after")
     def _check(self):

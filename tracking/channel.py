@@ -156,7 +156,7 @@ class TrackingSpec(BaseModel):
     lost_after_s: float = Field(1.0, gt=0.0, le=600.0)
     """A channel without lock for this long is given up."""
     settle_s: float = Field(0.6, ge=0.2, le=10.0)
-    """Length of the pull-in."""
+    """Least length of each stage of the pull-in."""
     pull_in_dll_bw_hz: float = Field(4.0, gt=0.0, le=20.0)
     """Code loop before bit synchronisation."""
     settle_pll_bw_hz: float = Field(12.0, gt=0.0, le=15.0)
