@@ -46,8 +46,7 @@ class Telemetry:
     def update(self):
         """Decode what the last ``Tracker.process`` brought -> list of (channel, event) of the decoders."""
         events = []
-        for c in np.flatnonzero(self.tracker.symbol_counts):
-            c = int(c)
+        for c in map(int, np.flatnonzero(self.tracker.symbol_counts)):
             if c not in self._base:
                 self.start(c)
             rows = self.tracker.symbols[c, : self.tracker.symbol_counts[c]]
