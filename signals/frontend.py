@@ -189,7 +189,8 @@ class FrontEnd:
         self.streaming = any(s is not None for s in (spec.filter, spec.agc, spec.impairments))
         taps = spec.filter.design(spec.fs_hz, spec.if_hz) if spec.filter else np.ones(1, complex)
         # White noise keeps sum |h|^2; the rest is taken to lie in the band.
-        rms = math.sqrt(np.sum(np.abs(taps) ** 2) + max(rms**2 - 1.0, 0.0))
+        if spec.filter:
+            rms = math.sqrt(np.sum(np.abs(taps) ** 2) + max(rms**2 - 1.0, 0.0))
         if spec.bits == 32:
             gain = 1.0
         elif spec.bits in RMS_LSB:
