@@ -6,7 +6,7 @@ except the histogram's chi-square.
 
 import copy
 import math
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -43,6 +43,9 @@ class _Moments:
 
 class _Restart:
     """``fresh``: a copy that keeps the training and begins at epoch 0."""
+
+    epoch: int
+    _rest: np.ndarray
 
     def fresh(self):
         """A copy that keeps the training and begins at epoch 0."""
@@ -227,6 +230,8 @@ class AdcHistogram(_Spec):
 
 
 class _AdcRun(_Restart):
+    totals: Any  # float (levels,); None before training
+
     def __init__(self, integration_s):
         self.integration_s, self.totals, self.epoch = integration_s, None, 0
 
