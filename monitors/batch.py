@@ -112,15 +112,16 @@ def simulate_trial(spec, runs, root, point, trial, n_epochs, settle_epochs=500, 
     twin = spec.start(trial_seed(root, point, trial))
     twin(settle_epochs)
     fresh = {name: run.fresh() for name, run in runs.items()}
-    parts, statistics = [], {name: [] for name in runs}
+    parts: list[np.ndarray] = []
+    values: dict[str, list[np.ndarray]] = {name: [] for name in runs}
     for lo in range(0, n_epochs, _PART * dumps):
         epochs, corr = twin(min(_PART * dumps, n_epochs - lo))
         parts.append(epochs)
         summed = sum_dumps(corr, dumps)
         for name, run in fresh.items():
-            statistics[name].append(run(summed))
+            values[name].append(run(summed))
     epochs = np.concatenate(parts)
-    statistics = {name: np.concatenate(v) for name, v in statistics.items()}
+    statistics = {name: np.concatenate(v) for name, v in values.items()}
     code_m = epochs["code_error_chips"] * METRES_PER_CHIP
     smoothed = np.empty(len(code_m))
     n_smooth = max(1, round(smooth_s / spec.integration_s))
