@@ -225,12 +225,12 @@ class GlrtRun:
         rng = np.random.Generator(np.random.Philox(seed))
         # Noise with covariance R: the root of R is the whitener's inverse.
         root = np.linalg.inv(self.whitener)
-        values = []
+        parts = []
         for _ in range(max(1, n_draws // _BLOCK)):
             g = rng.standard_normal((len(self.taps_chips), 2 * _BLOCK), np.float32)
             power = self.powers((root @ g).astype(np.float32))
-            values.append(0.5 * power.max(axis=0))
-        values = np.concatenate(values)
+            parts.append(0.5 * power.max(axis=0))
+        values = np.concatenate(parts)
         t = np.quantile(values, 1 - tail)
         return float(np.mean(values > t) * math.exp(t))
 
@@ -264,11 +264,11 @@ class GlrtRun:
             values.append(value)
             bins.append(where)
             ends.append(lo + last)
-        value, ends = np.concatenate(values or [[]]), np.concatenate(ends or [[]]).astype(np.int64)
+        value, end = np.concatenate(values or [[]]), np.concatenate(ends or [[]]).astype(np.int64)
         signed_hz = np.concatenate([self.frequency_hz, -self.frequency_hz])
         hz = signed_hz[np.concatenate(bins).astype(np.int64)] if bins else np.zeros(0)
-        index = None if sample_index is None else np.asarray(sample_index)[ends]
-        result = statistics(value, self.epoch + ends, self.integration_s, hz, index)
+        index = None if sample_index is None else np.asarray(sample_index)[end]
+        result = statistics(value, self.epoch + end, self.integration_s, hz, index)
         self.epoch += len(corr)
         return result
 
