@@ -200,7 +200,8 @@ class ParetoNull:
                 f"{math.ceil(_LEAST_EXCESSES / tail)} epochs or widen the tail"
             )
         u = float(values[-m - 1])
-        return cls(values, u, m / len(values), *_pareto_moments(values[-m:] - u), n)
+        xi, sigma = _pareto_moments(values[-m:] - u)
+        return cls(values, u, m / len(values), xi, sigma, n)
 
     def sf(self, x):
         """P(false alarm) at threshold x; the training's own share below u."""
