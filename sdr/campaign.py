@@ -506,6 +506,7 @@ def _line_offset_hz(twin: Twin, t_s: np.ndarray) -> np.ndarray:
     if not speed.any() or twin.jammers[0].line is None:
         return line_offset_hz(twin, t_s)
     cw = twin.jammers[0]
+    assert isinstance(cw, TwinCW)
     return cw.offset_hz + cw.rate_hz_s * t_s + speed / WAVELENGTH_M
 
 
@@ -734,7 +735,8 @@ def point_rate(k: np.ndarray, n: np.ndarray, seed: int) -> Any:
     if np.count_nonzero(k) < 5 or np.count_nonzero(k < n) < 5:
         # Too few trials of either kind to resample: as if each trial were a single test.
         p, m = k.sum() / n.sum(), len(n)
-        return Rate(int(k.sum()), int(n.sum()), float(p), *clopper_pearson(p * m, m), float(m))
+        low, high = clopper_pearson(p * m, m)
+        return Rate(int(k.sum()), int(n.sum()), float(p), low, high, float(m))
     size = -(-len(n) // 1000)
     edges = np.arange(0, len(n), size)
     return cluster_rate(np.add.reduceat(k, edges), np.add.reduceat(n, edges), seed)
