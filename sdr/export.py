@@ -8,7 +8,7 @@ import math
 import os
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -71,6 +71,7 @@ def export(
     with store.read(results) as h5:
         if any(wanted.values()):
             track = read_track(h5, results)
+            makers: dict[str, Callable[..., Iterable[str]]]
             makers = {"rinex_obs": _rinex, "nmea": nmea_lines, "kml": kml_lines, "gpx": gpx_lines}
             for name, path in wanted.items():
                 if path is not None:
@@ -114,7 +115,7 @@ class _replacing:
 
 def read_track(h5: h5py.File, results: Path) -> Track:
     """Valid positions of a results file; ValueError if it has none."""
-    rows = h5["navigation/solution"][:] if "navigation/solution" in h5 else np.empty(0)
+    rows: np.ndarray = h5["navigation/solution"][:] if "navigation/solution" in h5 else np.empty(0)
     rows = rows[rows["valid"]] if len(rows) else rows
     if not len(rows):
         raise ValueError(
@@ -278,8 +279,8 @@ def write_mat(h5: h5py.File, results: Path, directory: Path) -> list[Path]:
     files = []
     for k, group in enumerate(channels):
         path = Path(directory) / f"tracking_ch_{k}.mat"
-        with _replacing(path) as part, part.open("wb") as f:
-            savemat(f, dump(group, week), oned_as="row", do_compression=True)
+        with _replacing(path) as part:
+            savemat(str(part), dump(group, week), appendmat=False, oned_as="row", do_compression=True)
         files.append(path)
     return files
 
