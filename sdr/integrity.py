@@ -225,8 +225,8 @@ class IntegrityLive:
         self.seconds = 0.0
         """Processor time spent here."""
         self._filter: IntegrityRun | None = None
-        self._view: _FilterView | None = None
-        self._bank = None
+        self._view: Any = None  # _FilterView: what the monitors of the filter read of an Eskf
+        self._bank: Any = None  # run of the bias bank
         self._bank_names: list[str] = []
         self._until: dict[str, float] = {}
         self._failed: set[str] = set()
@@ -326,6 +326,7 @@ class IntegrityLive:
 
     def _fall_back(self, snap, corrected, h, var, t_s) -> None:
         """Keep to the constellation that agrees with itself, if exactly one does."""
+        assert self.spec.raim is not None
         agree = []
         for system in "GE":
             part = [i for i, n in enumerate(snap.names) if n[0] == system]
@@ -407,8 +408,8 @@ class IntegrityLive:
         if self._filter is None:
             return None
         remedy = self._filter(self._view, log.dx, log.z, log.h, log.seen)
-        for name, reason in remedy.unavailable.items():
-            self.alarms[name].lack(reason)
+        for part, reason in remedy.unavailable.items():
+            self.alarms[part].lack(reason)
         if remedy.als is not None:
             self._als_rows(log, remedy.als, sample, t_s, out)
         if remedy.bank is not None:
@@ -474,6 +475,7 @@ class IntegrityLive:
 
     def _bank_rows(self, log, report, sample, t_s, out) -> None:
         rows = [i for i in range(log.slots) if log.names[i] and log.seen[i]]
+        assert self.spec.parallel_filters is not None
         limit = self.spec.parallel_filters.threshold
         if rows:
             parts = [_row(log.names[i], sample, t_s, report.stat_long[i], limit) for i in rows]
@@ -557,7 +559,7 @@ class IntegrityLive:
             "als": 1e-6,
             "noise_rmd": 1e-6,
         }
-        out = []
+        out: list[dict[str, Any]] = []
         for name, a in self.alarms.items():
             head = {"name": name, "unavailable": a.reason, "unavailable_epochs": a.unavailable_epochs}
             if not a.tests:
