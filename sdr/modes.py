@@ -84,7 +84,7 @@ class SideBySide:
         steering = spec.receiver.steering
         names = list(dict.fromkeys(steering.compare))
         tee = Tee(source, len(names))
-        self.receivers = {
+        self.receivers: dict[str, Receiver] = {
             mode: Receiver(
                 spec.receiver.model_copy(update={"steering": steering.with_mode(mode)}),
                 view,
