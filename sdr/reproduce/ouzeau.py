@@ -26,8 +26,10 @@ from tracking.correlator_model import Dynamics, Twin, TwinCW, code_spectrum, wor
 from tracking.twin_kernels import hatch_smooth
 
 P_FA = 1.6e-5
-GPS = {"signal": "L1CA", "prn": 6, "cn0_dbhz": 40.5, "integration_s": 0.02, "early_late_space_chips": 1.0}
-GALILEO = {
+GPS: dict[str, Any] = {
+    "signal": "L1CA", "prn": 6, "cn0_dbhz": 40.5, "integration_s": 0.02, "early_late_space_chips": 1.0,
+}  # fmt: skip
+GALILEO: dict[str, Any] = {
     "signal": "E1B", "prn": 38, "waveform": "BOC11", "cn0_dbhz": 34.8, "integration_s": 0.004,
     "early_late_space_chips": 0.5,
 }  # fmt: skip
