@@ -8,7 +8,7 @@ the thesis; the others are not, since only that satellite fails.
 
 import math
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -127,6 +127,7 @@ def simulate(
     other = np.zeros(runs, dtype=np.int64)
     rmd = noise_rmd.NoiseRmd(window=n_r, scheme="printed", pairing="two_channel")
     empty = np.zeros((0, 0, 3))
+    monte_carlo: Any = pf.monte_carlo  # a kernel: starred arguments are beyond its type
     for lo in range(0, runs, 50):
         b = min(50, runs - lo)
         noise = rng.standard_normal((b, T_END, n)) @ s.root_qd.T
@@ -140,7 +141,7 @@ def simulate(
             np.zeros((0, 0, n)), np.zeros((0, 0, n, n)), np.zeros((0, 0, m))
         ]  # fmt: skip
         fixed = 0.0 if adapt else (SIGMA_FT * FOOT_M) ** 2 + bank.r0_m2
-        pf.monte_carlo(
+        monte_carlo(
             x0, noise, v, v2, sigma * FOOT_M, np.asarray(fault_ft) * FOOT_M, 0, baro, s.phi, s.qd, s.h, s.baro_h,
             np.array([baro_var_ft2 * FOOT_M**2]), s.p0, *layout, limits, T_WARM if detect else T_END + 1, ints,
             bank.window_epochs, np.zeros((m, n_r)), noise_rmd.SCHEMES[rmd.scheme], rmd.decay, rmd.divisor,
