@@ -94,8 +94,8 @@ def _header(
     x, y, z = solution["pos_ecef_m"].mean(axis=0)
     yield _label(f"{x:14.4f}{y:14.4f}{z:14.4f}", "APPROX POSITION XYZ")
     yield _label(f"{0:14.4f}{0:14.4f}{0:14.4f}", "ANTENNA: DELTA H/E/N")
-    for system, codes in sorted(by_system.items(), reverse=True):
-        yield _label(f"{system}  {len(codes):3d}" + "".join(f" {c}" for c in codes), "SYS / # / OBS TYPES")
+    for system, types in sorted(by_system.items(), reverse=True):
+        yield _label(f"{system}  {len(types):3d}" + "".join(f" {c}" for c in types), "SYS / # / OBS TYPES")
     yield _label("DBHZ", "SIGNAL STRENGTH UNIT")
     yield _label(_first(epochs[0]), "TIME OF FIRST OBS")
     # GPS C/A is the reference; Galileo's phase is not aligned to E1-B (system alone: not known).
