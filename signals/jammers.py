@@ -48,8 +48,8 @@ points)."""
 _CODE_CHIPS = 40_920
 """Length of the noise-like code of `MatchedSpectrum`: 40 ms, longer than the integrations."""
 
-Opener = Callable[[str, float], Callable[[int, int], np.ndarray]]
-"""(path, fs_hz) -> reader(n0, n) -> planar float32 (2, n); refuses a file of another rate."""
+Opener = Callable[[str, float], tuple[Callable[[int, int], np.ndarray], int]]
+"""(path, fs_hz) -> (reader(n0, n) -> planar float32 (2, n), length of the file); refuses a file of another rate."""
 
 
 class CodeLine(BaseModel):
