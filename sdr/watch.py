@@ -37,7 +37,7 @@ BATCH_S = 1.0
 """Monitors are called this often: a call costs more than an epoch."""
 NULL_EPOCHS = 102_400
 """Quiet epochs of the twin behind a threshold of the FFT or AR monitor."""
-MONITOR = np.dtype([("signal", "S4"), ("prn", "i4"), *((n, STATISTIC[n]) for n in STATISTIC.names)])
+MONITOR = np.dtype([("signal", "S4"), ("prn", "i4"), *((n, STATISTIC[n]) for n in STATISTIC.names or ())])
 """STATISTIC of one channel; ``t_s`` is scenario time at the end of its last epoch."""
 WATCHED = np.dtype(
     [
@@ -201,7 +201,7 @@ class _Channel:
         self._note(s)
         rows = np.empty(len(s), MONITOR)
         rows["signal"], rows["prn"] = self.signal.encode(), self.prn
-        for name in STATISTIC.names:
+        for name in STATISTIC.names or ():
             rows[name] = s[name]
         return rows
 
