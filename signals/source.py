@@ -10,6 +10,7 @@ import numpy as np
 
 from signals.codes import secondary_code
 from signals.constants import CHIP_RATE_HZ, F_L1_HZ
+from signals.faults import FaultySky
 from signals.frontend import FrontEndSpec
 from signals.inav import encode as encode_inav
 from signals.kernels import COMPONENT, synthesise, synthesise_int8
@@ -70,7 +71,7 @@ class SyntheticSource:
 
     def __init__(
         self,
-        sky: Sky,
+        sky: Sky | FaultySky,
         front_end: FrontEndSpec,
         duration_s: float,
         seed,
@@ -257,7 +258,10 @@ class SyntheticSource:
                 carrier[:, row, None] + spin,
                 np.stack([begin.real, change.real, begin.imag, change.imag], axis=-1),
             ))  # fmt: skip
-        return tuple(np.concatenate(p, axis=1) for p in zip(*parts)) if self.echoes else parts[0]
+        if not self.echoes:
+            return parts[0]
+        code, carrier, gain = (np.concatenate(p, axis=1) for p in zip(*parts))
+        return code, carrier, gain
 
     def _symbols(self, segment: int) -> tuple[np.ndarray, np.ndarray]:
         """Flat symbols of a segment and the components that point into them."""
@@ -329,7 +333,7 @@ def _code_buffer(satellites, fs_hz: float, path) -> tuple[np.ndarray, np.ndarray
     return np.concatenate(parts), components
 
 
-def _messages(sky: Sky, satellite: Satellite, start_s: int):
+def _messages(sky: Sky | FaultySky, satellite: Satellite, start_s: int):
     """(symbols, first code period, code periods per symbol) of each component from scenario time ``start_s`` on."""
     span_s = _SEGMENT_S + _LEAD_S + 2
     system = satellite.system
@@ -357,7 +361,7 @@ def _messages(sky: Sky, satellite: Satellite, start_s: int):
     return messages
 
 
-def truth(sky: Sky, sample_index, fs_hz: float) -> np.ndarray:
+def truth(sky: Sky | FaultySky, sample_index, fs_hz: float) -> np.ndarray:
     """TRUTH rows of the visible, genuine satellites at these samples, by sample, then satellite."""
     index = np.atleast_1d(np.asarray(sample_index, np.uint64))
     t = index / fs_hz
