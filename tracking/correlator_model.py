@@ -16,7 +16,7 @@ import math
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -315,7 +315,10 @@ def _noise_factor(signal, prn, waveform, bandwidth_hz, taps):
     """F with F F^T = R(d_i - d_j), float64 (K, K): Cholesky, or the symmetric root where R is singular."""
     d = np.array(taps)
     # Only what R depends on enters, so that twins of other settings share the factor.
-    spec = Twin.model_construct(signal=signal, prn=prn, waveform=waveform, bandwidth_hz=bandwidth_hz)
+    settings: dict[str, Any] = {
+        "signal": signal, "prn": prn, "waveform": waveform, "bandwidth_hz": bandwidth_hz,
+    }  # fmt: skip
+    spec = Twin.model_construct(**settings)
     R = spec.autocorrelation(d[:, None] - d[None, :])
     R = 0.5 * (R + R.T)
     try:
@@ -642,7 +645,7 @@ class TwinRun:
         self.state = np.array([first[0], rate, rate, ramp, first[2]])
         self.epoch = 0
         self._block = None
-        self._spans = None
+        self._spans: Any = None  # (spans, vectors) of the CW, once known
         slow = [n for n in s.nbis if isinstance(n, _SlowNBI)]
         self._slow = slow
         self._slow_hz = np.array([n.centre_hz for n in slow for _ in n.vectors], float)
@@ -809,7 +812,7 @@ def _with_taps(taps, spacing_chips):
 def _records(columns, epoch0, T):
     out = np.empty(len(columns), TWIN_EPOCH)
     out["t_s"] = (epoch0 + 0.5 + np.arange(len(columns))) * T
-    for name, column in zip(TWIN_EPOCH.names[1:], columns.T):
+    for name, column in zip((TWIN_EPOCH.names or ())[1:], columns.T):
         out[name] = column
     return out
 
@@ -914,8 +917,8 @@ class OpenLoopRun:
         self.left[:, :K] = self.stage.factor
         self.left[:, K] = self.R
         if vectors:
-            vectors = np.concatenate(vectors)
-            self.left[:, K + 1 + n_echo :: 2] = vectors.real.T
-            self.left[:, K + 2 + n_echo :: 2] = vectors.imag.T
+            joined = np.concatenate(vectors)
+            self.left[:, K + 1 + n_echo :: 2] = joined.real.T
+            self.left[:, K + 2 + n_echo :: 2] = joined.imag.T
         self.inner = np.empty((rows, 2 * BLOCK_EPOCHS), np.float32)
         self.out = np.empty((K, 2 * BLOCK_EPOCHS), np.float32)
