@@ -44,7 +44,11 @@ def run(
     source = scenario.source(spec, threads)
     path = Path(output) if output else Path(f"{spec.name}.h5")
     with Store(path, command="run", scenario=text, seed=spec.seed) as store:
-        side = SideBySide(spec, Watched(source), scenario.sensors(spec)) if spec.receiver.steering.compare else None
+        side = (
+            SideBySide(spec, Watched(source), scenario.sensors(spec))
+            if spec.receiver.steering.compare
+            else None
+        )
         sensors = scenario.sensors(spec) if spec.receiver.steering.mode == "ultra_tight" else None
         result = _receive(spec.receiver, source, store, spec.name, quiet, sensors, side)
     return _finish(result, path, plots)
@@ -229,7 +233,13 @@ def _receive(
                 _store_outcome(store, receiver, outcome, tally)
                 if side:
                     side.follow(outcome)
-                store.append("samples/spectrum", watched.rows(), fs_hz=source.fs_hz, if_hz=source.if_hz, every_s=EVERY_S)
+                store.append(
+                    "samples/spectrum",
+                    watched.rows(),
+                    fs_hz=source.fs_hz,
+                    if_hz=source.if_hz,
+                    every_s=EVERY_S,
+                )
                 truth.up_to(outcome.n_end)
                 if store.due():
                     store.checkpoint()
@@ -268,7 +278,11 @@ def _store_outcome(store: Store, receiver: Receiver, outcome: Outcome, tally: _T
         store.append(f"{name}/epochs", epochs, signal=signal, prn=prn, fs_hz=receiver.fs_hz)
         taps = receiver.tracker.taps_chips(c)
         store.append(
-            f"{name}/corr", corr[:, : len(taps)], taps_chips=taps, waveform=receiver.waveform(signal), **_roles(channels[c])
+            f"{name}/corr",
+            corr[:, : len(taps)],
+            taps_chips=taps,
+            waveform=receiver.waveform(signal),
+            **_roles(channels[c]),
         )
         locked = epochs["state"] == STATE_LOCKED
         tally.locked_s[signal, prn] += float(epochs["n_samples"][locked].sum()) / receiver.fs_hz
@@ -437,7 +451,9 @@ def _summary(result: dict[str, Any]) -> str:
         )
     for m in result["monitors"]:
         first = f", the first at {m['alarms'][0]['start_s']:.1f} s" if m["alarms"] else ""
-        rows.append(f"{m['name']} on {m['signal']} {m['prn']}: {len(m['alarms'])} alarms in {m['tests']} tests{first}")
+        rows.append(
+            f"{m['name']} on {m['signal']} {m['prn']}: {len(m['alarms'])} alarms in {m['tests']} tests{first}"
+        )
     if result.get("modes"):
         rows += table(result["modes"])
     rows.append(f"results in {result['output']}")
