@@ -108,4 +108,8 @@ def reproduce(name: str, out_dir: str | Path | None = None, quick: bool = False,
     rows = importlib.import_module(EXPERIMENTS[name]).run(out, quick=quick, seed=seed)
     count = {v: sum(r["verdict"] == v for r in rows) for v in VERDICTS}
     summary = ", ".join(f"{n} {v}" for v, n in count.items())
-    return {"items": rows, "output": str(out), "text": f"{format_table(rows)}\n{summary}; figures and tables in {out}"}
+    return {
+        "items": rows,
+        "output": str(out),
+        "text": f"{format_table(rows)}\n{summary}; figures and tables in {out}",
+    }
