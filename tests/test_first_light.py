@@ -53,7 +53,9 @@ def test_jitter_doppler_and_cn0_agree_with_theory_and_truth(demo):
     _, path = demo
     with h5py.File(path) as h5:
         truth = h5["truth/satellites"][:]
-        power_hz = {prn: 10 ** (truth["cn0_dbhz"][truth["prn"] == prn].mean() / 10) for prn in np.unique(truth["prn"])}
+        power_hz = {
+            prn: 10 ** (truth["cn0_dbhz"][truth["prn"] == prn].mean() / 10) for prn in np.unique(truth["prn"])
+        }
         for group in h5["tracking"].values():
             epochs, signal = group["epochs"][:], group["epochs"].attrs["signal"]
             mine = truth[truth["prn"] == group["epochs"].attrs["prn"]]
