@@ -2,7 +2,7 @@
 PY ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test bench lint clean
+.PHONY: demo test test-all bench lint clean
 
 .venv/installed: pyproject.toml
 	$(PY) -m venv .venv
@@ -21,6 +21,9 @@ demo: .venv/installed
 	$(BIN)/gnssbb run demo -o demo/demo.h5 --plots
 
 test: .venv/installed-test
+	$(BIN)/python -m pytest -n 2 -m "not slow"
+
+test-all: .venv/installed-test
 	$(BIN)/python -m pytest -n 2
 
 bench: .venv/installed
