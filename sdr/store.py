@@ -24,6 +24,14 @@ import numpy as np
 from sdr import SCHEMA_VERSION, version
 
 UNITS = {
+    "_m2_s3": "m^2/s^3",
+    "_dbw_hz": "dBW/Hz",
+    "_deg_s": "deg/s",
+    "_m2_s": "m^2/s",
+    "_mps2": "m/s^2",
+    "_ns": "ns",
+    "_mg": "mg",
+    "_mrad": "mrad",
     "_m_s2": "m/s^2",
     "_s_s2": "s/s^2",
     "_s_s": "s/s",
