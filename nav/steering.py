@@ -38,6 +38,8 @@ SLOTS = 24
 """Channels that one filter can hold."""
 MIN_CN0_DBHZ = 30.0
 """A channel is taken over in phase lock at this C/N0 at the least."""
+REPORT_EVERY = 5
+"""Epochs between new values of the slower columns of ``Steering.record``."""
 REFRESH_S = 1.0
 """Atmosphere and ephemerides are renewed this often."""
 INCONSISTENT_RATIO = 6.0
@@ -257,14 +259,14 @@ class Steering:
     def advance(self, sample: int, epochs, counts, channels_state, ephemerides) -> np.ndarray:
         """Predict to ``sample``, update from the epochs of the slab that ends there, command the next one.
 
-        ``epochs``, ``counts``: of ``Tracker.process``; ``channels_state`` (C,) STATE_* of the tracker's channels.
-        Returns AIDING (C,).
+        ``epochs``, ``counts``: of ``Tracker.process``; ``channels_state`` (C,) STATE_* of the tracker's channels;
+        ``ephemerides``: called once a second for the newest EPHEMERIS rows. Returns AIDING (C,).
         """
         for i in np.flatnonzero(self.active):
             if channels_state[self.slot[i]] != STATE_LOCKED:
                 self.drop(int(i))
         if sample >= self._next_refresh:
-            self.refresh(ephemerides)
+            self.refresh(ephemerides())
         commands = np.zeros(len(channels_state), AIDING)
         nis, rows, _ = self._step(sample, epochs, counts, commands)
         self._judge(sample, nis, rows)
@@ -299,7 +301,7 @@ class Steering:
             return np.zeros((1, kernels.N_SENSOR))
         last = int(np.searchsorted(self._sensor_sample, sample + 1, side="right"))
         first = last - self.per_epoch
-        if first < 0 or last > len(self._table):
+        if first < 0 or sample - self._sensor_sample[last - 1] > 1.5 * self.dt_s * self.fs_hz:
             raise ValueError(
                 f"sensor data do not cover sample {sample}; record them over the whole time of the samples"
             )
@@ -314,7 +316,7 @@ class Steering:
         f = self.filter
         usable = int(np.sum(f.cn0[self.active] > USABLE_CN0_HZ))
         if rows:
-            self._ratio += (nis / rows - self._ratio) / self.spec.update_hz
+            self._ratio += (min(nis / rows, 25.0) - self._ratio) / self.spec.update_hz
         sigma = np.zeros(2)
         kernels.predicted_sigma(f.code, f.x, f.p, f.los, self.active, sigma)
         self.sigma, self.usable = sigma, usable
@@ -324,7 +326,7 @@ class Steering:
             self.state = COASTING
             self._coast_since = sample if self._coast_since < 0 else self._coast_since
         why = ""
-        if not np.isfinite(f.x).all() or not np.isfinite(sigma).all():
+        if not np.isfinite(sigma).all() or not np.isfinite(np.concatenate(f.position())).all():
             why = "the filter's state is not finite"
         elif sigma[0] > self.spec.release_code_m:
             why = (
@@ -344,13 +346,10 @@ class Steering:
         r["nis"], r["rows"] = nis, rows
         r["sigma_range_m"], r["sigma_rate_mps"] = self.sigma
         r["n_steered"], r["n_used"] = int(self.active.sum()), self.usable
-        if self.filter is not None:
-            r["sigma_2d_m"] = kernels.horizontal_sigma(self.filter.code, self.filter.x, self.filter.p)
-            r["cn0_median_dbhz"] = (
-                10.0 * math.log10(max(float(np.median(self.filter.cn0[self.active])), 1.0))
-                if self.active.any()
-                else 0.0
-            )
+        if self.filter is not None and self.filter.epochs % REPORT_EVERY == 0:
+            f, cn0 = self.filter, np.sort(self.filter.cn0[self.active])
+            r["sigma_2d_m"] = kernels.horizontal_sigma(f.code, f.x, f.p)
+            r["cn0_median_dbhz"] = 10.0 * math.log10(max(float(cn0[cn0.size // 2]), 1.0)) if cn0.size else 0.0
 
     def solution(self, week: int) -> np.ndarray:
         """SOLUTION row of the last epoch; valid while the filter steers with satellites or coasts within 50 m."""

@@ -276,6 +276,8 @@ def watch_power(row, prompt_power, noise_power, span_s, fast_s, slow_s):
     """Fast and slow means of |P|^2 and of the noise tap's power, each per integration of the same length."""
     w = row[WEIGHT] + span_s
     kf, ks = span_s / min(w, fast_s + span_s), span_s / min(w, slow_s + span_s)
+    if prompt_power < 0.1 * row[P_FAST] and row[P_FAST] > STRONG * row[N_FAST]:
+        row[P_FAST] = prompt_power  # a strong signal that is gone is gone at once
     row[P_FAST] += kf * (prompt_power - row[P_FAST])
     row[P_SLOW] += ks * (prompt_power - row[P_SLOW])
     row[N_FAST] += kf * (noise_power - row[N_FAST])

@@ -271,7 +271,7 @@ class Receiver:
     def _steer(self, sample: int, epochs: np.ndarray, counts: np.ndarray, out: Outcome) -> None:
         steering = self.steering
         self._aiding = steering.advance(
-            sample, epochs, counts, self.tracker.channels["state"], self.telemetry.ephemerides()
+            sample, epochs, counts, self.tracker.channels["state"], self.telemetry.ephemerides
         )
         out.steering = steering.record.copy()
         if steering.filter is None:

@@ -132,8 +132,8 @@ class Trial:
     """Effective Q of each satellite, dB; empty: 0."""
     blocked_s: tuple[float, float] = (0.0, 0.0)
     spacing_chips: float = 1.0
-    imu: ImuSpec = ImuSpec(grade="karaim2020")
-    odometer: OdometerSpec = OdometerSpec()
+    imu: ImuSpec = field(default_factory=lambda: ImuSpec(grade="karaim2020"))
+    odometer: OdometerSpec = field(default_factory=OdometerSpec)
     clock_s_f: float = 0.009
     clock_s_g: float = 0.035
     fll_hz: float = 4.0
@@ -141,7 +141,7 @@ class Trial:
 
 
 def run(
-    sky: Sky, trial: Trial, spec: SteeringSpec, seed, policy: Policy = Policy(), guarded=True
+    sky: Sky, trial: Trial, spec: SteeringSpec, seed, policy: Policy = Policy(), guarded=True, watch=0
 ) -> np.ndarray:
     """One trial -> (epochs / EVERY, N_OUT), see ``uttwin_kernels.N_OUT``; ``seed`` (int or SeedSequence) alone decides."""
     seq = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
@@ -164,7 +164,7 @@ def run(
         gains = np.array([math.sqrt(2.0) * wn, wn * wn, 4 * bt / (1 + 2 * bt)])
         scalar_run(
             noise, sky.pos[0].copy(), T_S, half, sky.sat_pos, sky.sat_vel, sky.rho, sky.rate, sky.pos, sky.vel, bias, drift,
-            cn0, jam, q_rc, amplitude, gains, 10**2.2, 1.0, guarded, sky.r_le, EVERY, 0, out,
+            cn0, jam, q_rc, amplitude, gains, 10**2.2, 1.0, guarded, sky.r_le, EVERY, watch, out,
         )  # fmt: skip
         return out
     model = build_model(spec, trial.imu, trial.odometer)
@@ -177,7 +177,7 @@ def run(
         spec.rate_floor_mps, table, policy.sign, 10 ** (policy.fixed_dbhz / 10) if policy.fixed_dbhz > 0 else 0.0,
         policy.use_gain, 10 ** (policy.skip_below_dbhz / 10) if policy.skip_below_dbhz > 0 else 0.0, T_S, half, sky.sat_pos,
         sky.sat_vel, sky.sat_acc, sky.rho, sky.rate, sky.pos, sky.vel, bias, drift, cn0, jam, q_rc, amplitude, sky.r_le,
-        EVERY, 0, out,
+        EVERY, watch, out,
     )  # fmt: skip
     return out
 

@@ -1,0 +1,252 @@
+"""Vector and ultra-tight steering: discriminators, kernels against the Specs, the twin, IF samples, refusals."""
+
+import numpy as np
+import pytest
+
+from nav import ultratight as ut
+from nav import ultratight_kernels as kernels
+from nav.errormodels import Ecef17
+from nav.imu import ImuSpec, OdometerSpec
+from nav.riss import Riss11, RissSf
+from nav.steering import Sensors, Steering
+from nav.ultratight import Filter, Kinematic, SteeringSpec, discriminator_table, nominal_of, start_covariance
+from sdr.uttwin import Policy, Sky, Trial, batch, drive, summary
+from sdr.uttwin_kernels import correlate
+
+T_S = 0.02
+POS = np.array([1_070_000.0, -4_450_000.0, 4_428_000.0])
+VEL = np.array([6.0, 5.0, 4.0])
+MODELS = [RissSf(), Riss11(velocity_noise_mps2_rthz=0.05), Ecef17(), Kinematic()]
+
+
+@pytest.fixture(scope="module")
+def sky():
+    span_s = 72.0
+    return Sky(span_s, drive(span_s).start(span_s))
+
+
+# -- discriminators ---------------------------------------------------------------------------------------------
+
+
+def _looked_up(cn0_dbhz, spacing=1.0):
+    row = np.empty(4)
+    kernels.look_up(discriminator_table("L1CA", spacing), 10 ** (cn0_dbhz / 10) * T_S, row)
+    return row
+
+
+def test_gain_agrees_with_an_independent_simulation():
+    # d = 1 chip, T = 20 ms: the design note's own check with the full tap covariance, given to three digits.
+    for cn0, gain in ((44, 0.998), (35, 0.983), (30, 0.932), (25, 0.696), (20, 0.337)):
+        assert _looked_up(cn0)[0] == pytest.approx(gain, abs=0.01)
+
+
+@pytest.mark.parametrize("spacing", [0.5, 1.0])
+def test_variance_is_the_theory_where_the_signal_is_strong(spacing):
+    for cn0 in (40, 45):
+        x = 10 ** (cn0 / 10) * T_S
+        row = _looked_up(cn0, spacing)
+        code = spacing / (4 * x) * (1 + 2 / ((2 - spacing) * x))
+        freq = 2 / x * (1 + 1 / x) / (2 * np.pi) ** 2
+        assert row[1] == pytest.approx(code, rel=5 * np.sqrt(2 / 16384) + 0.01)
+        assert row[3] == pytest.approx(freq, rel=5 * np.sqrt(2 / 16384) + 0.01)
+
+
+@pytest.mark.parametrize("cn0_dbhz", [20.0, 30.0, 44.0])
+def test_twin_correlators_have_the_tables_gain_and_noise(cn0_dbhz):
+    n, eps, df = 20_000, 0.03, 2.0
+    out = np.empty((2, n, 4))
+    for k, sign in enumerate((1, -1)):
+        rng = np.random.Generator(np.random.Philox(5))
+        for i in range(n):
+            noise = 1 / (10 ** (cn0_dbhz / 10) * T_S)
+            correlate(rng, sign * eps, sign * df, T_S, noise, 1.0, 0.5, 0.5, 0.0, out[k, i])
+    row = _looked_up(cn0_dbhz)
+    slope = (out[0, :, 0] - out[1, :, 0]).mean() / (2 * eps)
+    slope_f = (out[0, :, 1] - out[1, :, 1]).mean() / (2 * df)
+    sd, sd_f = np.sqrt(row[1]), np.sqrt(row[3]) / (0.5 * T_S)
+    assert slope == pytest.approx(row[0], abs=5 * sd / (np.sqrt(n) * eps) + 0.02)
+    assert slope_f == pytest.approx(row[2], abs=5 * sd_f / (np.sqrt(n) * df) + 0.02)
+    assert out[0, :, 0].std() == pytest.approx(sd, rel=5 / np.sqrt(n) + 0.03)
+    # The prompt at this offset, R(0.03)^2 sinc^2, plus noise; the noise tap alone.
+    assert out[0, :, 3].mean() == pytest.approx(noise, rel=5 / np.sqrt(n))
+    assert out[0, :, 2].mean() == pytest.approx(
+        0.97**2 + noise, rel=5 * 2 * np.sqrt(noise / n) + 5 / np.sqrt(n) + 0.01
+    )
+
+
+# -- kernels against the Specs ----------------------------------------------------------------------------------
+
+
+def _nominal(model):
+    return nominal_of(model, POS, VEL, 20.0, 3.0, speed_mps=None)
+
+
+@pytest.mark.parametrize("model", MODELS, ids=lambda m: m.kind)
+def test_maps_are_the_derivative_of_injection(model):
+    code, x, n = ut.model_code(model), _nominal(model), model.n + 1
+    tp, tv = np.empty((3, n)), np.empty((3, n))
+    kernels.maps(code, x, tp, tv)
+    pos, vel = np.empty((2, 3)), np.empty((2, 3))
+    for j in range(n):
+        size = max(np.abs(tp[:, j]).max(), np.abs(tv[:, j]).max(), 1.0)
+        step = 1e-2 / size if size > 10 else 1e-4
+        for k, s in enumerate((1, -1)):
+            y, dx = x.copy(), np.zeros(n)
+            dx[j] = s * step
+            kernels.inject(code, y, dx)
+            kernels.position_velocity(code, y, pos[k], vel[k])
+        assert (pos[0] - pos[1]) / (2 * step) == pytest.approx(tp[:, j], rel=1e-5, abs=2e-9 / step)
+        # The turn of the local axes with the position is left out of T_v: |v| / R per metre.
+        assert (vel[0] - vel[1]) / (2 * step) == pytest.approx(
+            tv[:, j], rel=1e-5, abs=2e-6 * size + 1e-10 / step
+        )
+    ib, idr = kernels.clock_states(code)
+    cb, cd = kernels.clock_columns(code)
+    y, dx = x.copy(), np.zeros(n)
+    dx[ib], dx[idr], dx[n - 1] = 1.0, 2.0, 3.0
+    kernels.inject(code, y, dx)
+    assert (y[cb] - x[cb], y[cd] - x[cd], y[kernels.ISB] - x[kernels.ISB]) == pytest.approx((1, 2, 3))
+
+
+@pytest.mark.parametrize("model", MODELS[:2], ids=lambda m: m.kind)
+def test_prediction_is_that_of_the_riss_spec(model):
+    x = _nominal(model)
+    p = start_covariance(model, x)
+    sensors = np.tile([0.001, 0.0, -0.05, 0.1, 0.5, -9.8, 8.7], (2, 1))
+    other, q = x[:19].copy(), p[:-1, :-1].copy()
+    phi, _ = model.epoch(other, q, -sensors[:, 2], sensors[:, 3], sensors[:, 4], sensors[:, 6], 0.01)
+    f, phi2, qd2 = (np.zeros_like(p) for _ in range(3))
+    kernels.predict(
+        ut.model_code(model), x, p, sensors, 0.01, model.pitch_filter_s, ut.model_rates(model), ut.extended_q(model, x), f,
+        phi2, qd2,
+    )  # fmt: skip
+    assert np.array_equal(other, x[:19])
+    assert phi2[:-1, :-1] == pytest.approx(phi, rel=1e-12, abs=1e-18)
+    assert p[:-1, :-1] == pytest.approx(q, rel=1e-9, abs=1e-18)
+
+
+# -- the twin ---------------------------------------------------------------------------------------------------
+
+
+def _nees(sky, trial, model, n_runs, at_s):
+    spec = SteeringSpec(mode="ultra_tight", model=model)
+    out = batch(sky, trial, spec, n_runs, seed=7)
+    rows = np.round(np.array(at_s) * 10).astype(int) - 1
+    return out[:, rows, 8], out[:, 200:, 9] / out[:, 200:, 10]
+
+
+@pytest.mark.parametrize("model", ["riss_sf", "ecef17"])
+@pytest.mark.parametrize("js_db", [0.0, 35.0])
+def test_errors_and_innovations_are_as_large_as_claimed(sky, model, js_db):
+    n = 16
+    nees, ratio = _nees(sky, Trial(js_db=js_db, jam_s=(25.0, 70.0)), model, n, (35.0, 68.0))
+    # 5 dof each; two instants 33 s apart count as one sample, the smaller the number of freedoms the wider the bound.
+    sd = np.sqrt(2 * 5 / n)
+    assert abs(nees.mean() - 5.0) < 5 * sd, f"NEES {nees.mean():.2f} of 5"
+    # NIS: 16 rows an epoch; the C/N0 is estimated over 0.1 s, which scatters R by its own relative error.
+    assert 0.85 < ratio.mean() < 1.1, f"NIS / rows {ratio.mean():.3f}"
+
+
+def test_wrong_sign_of_the_discriminators_does_not_hold(sky):
+    good = batch(sky, Trial(), SteeringSpec(mode="ultra_tight"), 1, seed=1)
+    bad = batch(sky, Trial(), SteeringSpec(mode="ultra_tight"), 1, seed=1, policy=Policy(sign=-1.0))
+    assert np.hypot(good[0, -1, 0], good[0, -1, 1]) < 1.0
+    assert np.hypot(bad[0, -1, 0], bad[0, -1, 1]) > 20.0 or bad[0, -1, 11] < 4
+
+
+def test_ultra_tight_beats_vector_beats_scalar(sky):
+    trial = Trial(js_db=52.0, jam_s=(20.0, 65.0))
+    got = {m: summary(batch(sky, trial, SteeringSpec(mode=m), 5, seed=2), trial) for m in ut.MODES}
+    assert np.median(got["ultra_tight"]["rms_jam_2d_m"]) < 2.5
+    assert np.median(got["vector"]["rms_jam_2d_m"]) > 10 * np.median(got["ultra_tight"]["rms_jam_2d_m"])
+    assert np.all(got["scalar"]["lost"] == 8)
+    assert np.all(got["scalar"]["no_fix"] > 0.9)
+
+
+def test_clean_receivers_are_good_to_half_a_metre(sky):
+    for mode in ("vector", "ultra_tight"):
+        s = summary(batch(sky, Trial(), SteeringSpec(mode=mode), 4, seed=3), Trial(jam_s=(20.0, 70.0)))
+        assert np.median(s["rms_2d_m"]) < 0.5
+
+
+def test_every_satellite_is_back_within_a_second_of_an_outage(sky):
+    trial = Trial(blocked_s=(25.0, 55.0), jam_s=(25.0, 55.0))
+    out = batch(sky, trial, SteeringSpec(mode="ultra_tight"), 6, seed=4)
+    assert np.all(out[:, 559, 11] == 8)  # 56 s
+    s = summary(out, trial)
+    # 30 s of dead reckoning: gyro walk 1 deg/rt-h at 10 m/s gives 0.17 m rms per axis after 30 s (v q t^1.5 / sqrt 3), the
+    # start heading's 1 mrad 0.3 m and the scale factor's 0.2 % 0.6 m.
+    assert np.median(s["rms_jam_2d_m"]) < 2.0
+
+
+def test_results_depend_on_the_seed_alone(sky):
+    one = batch(sky, Trial(js_db=40.0), SteeringSpec(mode="vector"), 2, seed=9)
+    two = batch(sky, Trial(js_db=40.0), SteeringSpec(mode="vector"), 2, seed=9)
+    assert np.array_equal(one, two, equal_nan=True)
+    assert not np.array_equal(one[0], one[1])
+
+
+# -- the run ----------------------------------------------------------------------------------------------------
+
+
+def _sensors(rate_hz=100.0, odometer=True):
+    rows = np.zeros(
+        50, [("sample_index", "u8"), ("t_s", "f8"), ("gyro_rad_s", "f8", 3), ("accel_mps2", "f8", 3)]
+    )
+    rows["t_s"] = (np.arange(50) + 1) / rate_hz
+    rows["sample_index"] = np.round(rows["t_s"] * 4e6)
+    speeds = np.zeros(50, [("sample_index", "u8"), ("t_s", "f8"), ("speed_mps", "f8")])
+    speeds["t_s"], speeds["sample_index"], speeds["speed_mps"] = rows["t_s"], rows["sample_index"], 10.0
+    return Sensors(ImuSpec(), OdometerSpec() if odometer else None, rows, speeds if odometer else None)
+
+
+SPACING = {"L1CA": 0.5, "E1": 0.25}
+
+
+def test_a_filter_that_knows_too_little_lets_go():
+    steering = Steering(SteeringSpec(mode="ultra_tight"), 4e6, _sensors(), SPACING)
+    x = _nominal(steering.model)
+    steering.filter = Filter(
+        steering.spec, steering.model, x, start_covariance(steering.model, x, bias_m=500.0), 24
+    )
+    steering.active[:4] = True
+    steering.filter.los[:4] = np.eye(4, 3)
+    steering._judge(80_000, 1.0, 4)
+    assert steering.state == ut.LOST
+    assert steering.filter is None
+    assert "a range is predicted no better than" in steering.reason
+
+
+@pytest.mark.parametrize(
+    ("build", "says"),
+    [
+        (
+            lambda: Steering(SteeringSpec(mode="ultra_tight"), 4e6, None, SPACING),
+            "needs an IMU and an odometer",
+        ),
+        (
+            lambda: Steering(SteeringSpec(mode="ultra_tight"), 4e6, _sensors(odometer=False), SPACING),
+            "odometer",
+        ),
+        (
+            lambda: Steering(SteeringSpec(mode="ultra_tight"), 4e6, _sensors(50.0), SPACING),
+            "sensors.imu.rate_hz",
+        ),
+        (
+            lambda: Steering(SteeringSpec(mode="ultra_tight", update_hz=30), 4e6, _sensors(), SPACING),
+            "multiple",
+        ),
+        (lambda: SteeringSpec(mode="vector", model="riss_sf"), "has no sensors"),
+        (lambda: SteeringSpec(mode="ultra_tight", model="kinematic"), "inertial model"),
+    ],
+)
+def test_settings_that_do_not_fit_are_refused(build, says):
+    with pytest.raises(ValueError, match=says):
+        build()
+
+
+def test_sensor_data_that_end_are_refused():
+    steering = Steering(SteeringSpec(mode="ultra_tight"), 4e6, _sensors(), SPACING)
+    assert steering._sensors(80_000).shape == (2, kernels.N_SENSOR)
+    with pytest.raises(ValueError, match="do not cover"):
+        steering._sensors(4_000_000)
