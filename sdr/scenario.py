@@ -48,6 +48,8 @@ class ReceiverSpec(BaseModel):
     navigation: NavigationSpec = NavigationSpec()
     mitigation: MitigationSpec | None = None
     steering: SteeringSpec = SteeringSpec()
+    codes_path: str | None = None
+    """Another table of the Galileo E1 primary codes (CSV, or the directory that holds it) than the one shipped."""
     slab_ms: Annotated[int, Field(ge=20, le=1000, multiple_of=20)] = 200
     """Longest slab of samples that passes through the loop at once; the results hardly depend on it."""
     search_every_s: Annotated[float, Field(gt=0)] = 5.0
@@ -118,13 +120,13 @@ NOISE, CLOCK, SKY, JAMMERS, MULTIPATH, SENSORS = range(6)
 
 def source(spec: Scenario, threads: int = 1) -> SyntheticSource:
     """The samples of a scenario."""
-    motion = spec.motion.start()
+    motion = spec.motion.start(spec.duration_s)
     clock = spec.clock.start(_child(spec, CLOCK), spec.duration_s, motion)
     sky = spec.sky.start(motion, clock, spec.duration_s, _child(spec, SKY))
     return SyntheticSource(
         faulty(sky, spec.fault, spec.duration_s), spec.front_end, spec.duration_s, _child(spec, NOISE),
         jammers=jammers(spec, spec.front_end.fs_hz, spec.front_end.if_hz, spec.front_end.complex, sky),
-        echoes=echoes(spec, [s.name for s in sky.satellites]), threads=threads,
+        echoes=echoes(spec, [s.name for s in sky.satellites]), threads=threads, code_path=spec.sky.codes_path,
     )  # fmt: skip
 
 
@@ -132,7 +134,7 @@ def sensors(spec: Scenario) -> Sensors | None:
     """The scenario's IMU and odometer, simulated from its motion; None where it has no ``[sensors]``."""
     if spec.sensors is None:
         return None
-    motion = spec.motion.start()
+    motion = spec.motion.start(spec.duration_s)
     fs_hz, span_s = spec.front_end.fs_hz, spec.duration_s
     imu = simulate_imu(motion, spec.sensors.imu, _child(spec, SENSORS, 0), span_s, fs_hz)[0]
     odometer = None
