@@ -5,6 +5,7 @@ from collections import deque
 from collections.abc import Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 
@@ -349,9 +350,10 @@ def _messages(sky: Sky | FaultySky, satellite: Satellite, start_s: int):
         almanac = almanac[almanac["system"] == system.encode()]
         tow = sky.tow_s + start_s
         week, tow = sky.week + tow // 604_800, tow % 604_800
+        iono_utc: Any = sky.iono_utc[()]  # np.void
         messages = [
             (
-                encode(satellite.ephemeris, sky.iono_utc[()], almanac, week, tow, span_s * per_s),
+                encode(satellite.ephemeris, iono_utc, almanac, week, tow, span_s * per_s),
                 first,
                 periods,
             )
