@@ -280,7 +280,8 @@ class Results:
         out.append("campaign/trials", np.concatenate(rows) if rows else np.zeros(0, TRIAL))
         rates = self.rows()
         table = np.array(
-            [tuple(r[f] if r[f] is not None else np.nan for f in RATE.names or ()) for r in _for_hdf5(rates)], RATE
+            [tuple(r[f] if r[f] is not None else np.nan for f in RATE.names or ()) for r in _for_hdf5(rates)],
+            RATE,
         )
         out.append("campaign/rates", table)
         out.checkpoint(complete=complete)
