@@ -542,8 +542,11 @@ class Navigator:
         )  # fmt: skip
         taken[np.tile(out, 2)] = 0
         self.innovations = np.column_stack([innovation, variance, taken])
-        los = sats["pos_ecef_m"] - before[:3]
-        los /= np.linalg.norm(los, axis=1, keepdims=True)
+        los, unused = np.zeros((obs.size, 3)), np.empty(obs.size)
+        kernels.predict_ranges(
+            np.ascontiguousarray(sats["pos_ecef_m"]), np.ascontiguousarray(sats["vel_ecef_mps"]),
+            before[:3], before[3:6], unused, unused, los,
+        )  # fmt: skip
         part = np.zeros(obs.size, bool)
         part[np.flatnonzero(use)[taken[:n] == 1]] = True
         full = np.zeros((2, obs.size))

@@ -32,6 +32,8 @@ from monitors.protection import Protection, _horizontal_tail, _level, _vertical_
 from nav.frames import geodetic_from_ecef, rotation_enu_to_ecef
 from nav.navigator import Navigator, Snapshot
 from nav.navlog import EXCLUDED_M2, REMEDY, NavigatorLog, Remedy
+from nav.ultratight import discriminator_table
+from nav.ultratight_kernels import look_up
 from signals.constants import METRES_PER_CHIP
 from tracking.channel import STATE_LOCKED
 
@@ -505,7 +507,8 @@ class IntegrityLive:
             scheme = SCHEMES[self.spec.noise_rmd.scheme]
             mean = window_variance(kept, window, scheme, self.spec.noise_rmd.decay)
             t_s = float(locked["n_samples"][-1]) / self.fs_hz
-            share = loop_share(0.0 if steered else loops.dll_bw_hz, t_s)
+            gain = code_gain(name[0], loops.early_late_space_chips, float(np.median(locked["cn0_dbhz"])), t_s)
+            share = loop_share(0.0 if steered else loops.dll_bw_hz, t_s, gain)
             self._rmd[name] = mean * share + self.spec.noise_rmd.r0_m2
 
     def _noise_rows(self, snap, sample, t_s, out) -> None:
@@ -587,19 +590,27 @@ class IntegrityLive:
 # -------------------------------------------------------------------------------------------------------- small parts
 
 
-def loop_share(dll_bw_hz: float, integration_s: float) -> float:
+def loop_share(dll_bw_hz: float, integration_s: float, gain: float = 1.0) -> float:
     """Variance of the replica's code phase over E[(e_{k+1} - e_k)^2] of successive discriminators e.
 
-    First-order loop x' = x - a (x + n), e = x + n, a = 4 B T / (1 + 2 B T): the range carries x, of variance
-    a / (2 - a) that of n, and E[d^2] = a^2 E[x^2] + ((1 + a)^2 + 1) E[n^2]. Without a loop (B = 0: steered from outside)
-    the measurement is n itself: E[d^2] = 2 E[n^2].
+    First-order loop x' = x - a e, e = g x + n, a = 4 B T / (1 + 2 B T), g the discriminator's gain in noise: the range
+    carries x, E[x^2] = a / (g (2 - g a)) E[n^2], and E[d^2] = (g^2 a)^2 E[x^2] + ((1 + g a)^2 + 1) E[n^2]. Without a loop
+    (B = 0: steered from outside) the measurement is n / g itself.
     """
     if dll_bw_hz == 0.0:
-        return 0.5
+        return 0.5 / gain**2
     bt = dll_bw_hz * integration_s
     a = 4.0 * bt / (1.0 + 2.0 * bt)
-    x = a / (2.0 - a)
-    return x / (a * a * x + (1.0 + a) ** 2 + 1.0)
+    x = a / (gain * (2.0 - gain * a))
+    return x / ((gain * gain * a) ** 2 * x + (1.0 + gain * a) ** 2 + 1.0)
+
+
+def code_gain(signal: str, spacing_chips: float, cn0_dbhz: float, integration_s: float) -> float:
+    """Gain of the normalised code discriminator in noise (``nav.ultratight.discriminator_table``)."""
+    row = np.empty(4)
+    table = discriminator_table("L1CA" if signal == "G" else "E1", spacing_chips)
+    look_up(table, 10.0 ** (0.1 * cn0_dbhz) * integration_s, row)
+    return float(row[0])
 
 
 def _row(
