@@ -336,6 +336,7 @@ class Navigator:
 
     def _asked(self, sats, field, otherwise):
         """A field of the remedy for each satellite; ``otherwise`` where it says nothing."""
+        assert self._remedy is not None
         at = self._remedy.find(sats["system"], sats["prn"])
         values = np.append(self._remedy.rows[field], otherwise)  # index -1 is the last
         return values[at]
@@ -556,6 +557,7 @@ class Navigator:
             own = np.concatenate([self._own_variance(obs, sats)[use], own_rate_var])
             both = np.concatenate([range_var, rate_var])
             dx = self._x - before
+            assert self.snapshot is not None
             self.log.updated(
                 sample / self.fs_hz,
                 self.snapshot.names,
