@@ -7,6 +7,7 @@ the next scalar fix starts it anew. Nothing diverges silently.
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -70,6 +71,8 @@ class Steering:
     After ``advance``: ``state``, ``record`` (STEERING row), ``reason`` (why it is not steering).
     """
 
+    filter: Any  # Filter while it steers, else None
+
     def __init__(
         self,
         spec: SteeringSpec,
@@ -110,6 +113,7 @@ class Steering:
         self._ratio, self._next_refresh = 1.0, 0
 
     def _read_sensors(self):
+        assert self.sensors is not None
         rate = self.sensors.imu_spec.rate_hz
         step = float(np.median(np.diff(self.sensors.imu["t_s"])))
         if abs(step * rate - 1.0) > 1e-3:
@@ -228,7 +232,9 @@ class Steering:
         newest = {(e["system"].decode(), int(e["prn"])): e for e in ephemerides}
         rows = np.flatnonzero(self.active)
         for i in rows:
-            signal, prn = self.name[i]
+            name = self.name[i]
+            assert name is not None
+            signal, prn = name
             eph = newest.get(("G" if signal == "L1CA" else "E", prn))
             if eph is not None:
                 self._set_orbit(i, eph)
