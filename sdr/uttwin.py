@@ -27,7 +27,7 @@ from nav.ultratight import (
 from sdr.uttwin_kernels import N_OUT, aided_run, scalar_run
 from signals.constants import CHIP_RATE_HZ
 from signals.orbits import nominal_constellation
-from signals.trajectory import Segment, Segments
+from signals.trajectory import Motion, Segment, Segments
 
 T_S = 0.02
 EVERY = 5
@@ -36,7 +36,8 @@ EVERY = 5
 
 def drive(duration_s=600.0, speed_mps=10.0, **place) -> Segments:
     """A land drive at constant speed (seed 003: 36 km/h), straights of 30 s and right and left turns of 90 deg in 12 s."""
-    turns, segment, t = (1, 1, -1, 1, -1, -1), [], 0.0
+    turns, t = (1, 1, -1, 1, -1, -1), 0.0
+    segment: list[Segment] = []
     while t < duration_s:
         segment += [
             Segment(duration_s=30.0),
@@ -66,7 +67,7 @@ class Sky:
     """Geometry of one drive at 50 Hz, shared by all trials."""
 
     duration_s: float
-    motion: object
+    motion: Motion
     n_satellites: int = 8
     sat_pos: np.ndarray = field(init=False)
 
