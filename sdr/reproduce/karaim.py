@@ -7,6 +7,7 @@ C/N0 44 dB-Hz, T 20 ms, jam from 180 to 270 s of 570 s; quick: 60 to 150 s of 18
 
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -93,7 +94,7 @@ def quantities(out: np.ndarray) -> np.ndarray:
     return np.stack([ve, vn, vu, v2, np.hypot(v2, vu), e, n, u, p2, np.hypot(p2, u)], axis=-1)
 
 
-def _interval(values):
+def _interval(values) -> tuple[Any, Any, Any]:
     """Median over runs and its distribution-free 95 % interval (order statistics)."""
     values = np.sort(values[np.isfinite(values)])
     if values.size == 0:
@@ -254,7 +255,7 @@ def _on_samples():
     from signals.jammers import CW, CodeLine, Narrowband
 
     times = {"against": "G01", "start_s": 45.0, "stop_s": 85.0}
-    jammers = [
+    jammers: list[tuple[str, CW | Narrowband]] = [
         (f"2.4 kHz tone, J/S {js} dB", Narrowband(bandwidth_hz=BANDWIDTH_HZ, js_db=js, **times))
         for js in (30, 45, 55)
     ]
