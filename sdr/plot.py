@@ -36,6 +36,8 @@ def figure(
 
 def plot(results: Path, directory: Path | None = None) -> list[Path]:
     """Draw every figure that ``results`` has data for; returns their paths."""
+    from sdr.integrity_figures import integrity, stanford
+
     directory = directory or Path(results).with_suffix("")
     with store.read(results) as h5:
         directory.mkdir(parents=True, exist_ok=True)
@@ -51,6 +53,8 @@ def plot(results: Path, directory: Path | None = None) -> list[Path]:
             _spectrum,
             _attack,
             _attacked_peak,
+            integrity,
+            stanford,
         ):
             path = draw(h5, channels, directory)
             if path is not None:
