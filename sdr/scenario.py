@@ -57,9 +57,11 @@ class ReceiverSpec(BaseModel):
     search_one_every_s: Annotated[float, Field(gt=0)] = 10.0
     """Later, one satellite in turn is searched this often."""
     monitor: tuple[WatchSpec, ...] = ()
-    integrity: IntegritySpec | None = None
-    respond: RespondSpec = RespondSpec()
     """Monitors on the live correlator outputs."""
+    integrity: IntegritySpec | None = None
+    """Monitors on the ranges and on the filter's innovations."""
+    respond: RespondSpec = RespondSpec()
+    """What the integrity monitors may do."""
 
     @model_validator(mode="after")
     def _monitors(self) -> "ReceiverSpec":

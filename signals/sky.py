@@ -130,9 +130,9 @@ class SkySpec(BaseModel):
     ionosphere: Literal["klobuchar", "none"] = "klobuchar"
     """Ionosphere of the truth."""
     troposphere: Literal["saastamoinen", "none"] = "saastamoinen"
+    """Troposphere of the truth."""
     codes_path: str | None = None
     """Another table of the Galileo E1 primary codes (CSV, or the directory that holds it) than the one shipped."""
-    """Troposphere of the truth."""
 
     @field_validator("start_time")
     @classmethod
