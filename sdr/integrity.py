@@ -73,6 +73,8 @@ RESPONSE = np.dtype(
 )
 """What was asked of the next epoch, one row per satellite that anything was asked of."""
 MONITORS = ("innovation", "raim", "bias_bank", "als", "noise_rmd", "parallel_filters")
+MEMORY = 50
+"""Epochs over which the onset of an identified bias is looked for."""
 _FROZEN = ConfigDict(frozen=True, extra="forbid")
 
 
@@ -238,13 +240,15 @@ class IntegrityLive:
         self._differences: dict[str, np.ndarray] = {}
         self._last: dict[str, tuple[int, float]] = {}
         self._only: tuple[str, float] = ("", 0.0)
+        self._past: list[tuple[list[str], np.ndarray, np.ndarray]] = []
+        self._new_bias: dict[str, float] = {}
 
     def watch(self, navigator: Navigator) -> None:
         """Have the navigator's filter logged where a monitor needs it."""
         if navigator.spec.kind != "ekf":
             return
-        need = 2 if self.spec.als is None else self.spec.als.window_epochs + self.spec.als.settle_epochs
-        navigator.log = NavigatorLog(length=max(need, 2))
+        need = MEMORY if self.spec.als is None else self.spec.als.window_epochs + self.spec.als.settle_epochs
+        navigator.log = NavigatorLog(length=max(need, MEMORY))
 
     # -- one epoch ---------------------------------------------------------------------------------------------------
 
@@ -262,6 +266,9 @@ class IntegrityLive:
         for name, rows in out.items():
             if name in self.alarms:
                 self.alarms[name].add(rows)
+        undo = self._undo(navigator.log)
+        if undo is not None:
+            dx = undo if dx is None else dx + undo
         self._answer(snap, t_s, dx)
         if self.remedy is not None and len(self.remedy.rows):
             rows = np.zeros(len(self.remedy.rows), RESPONSE)
@@ -366,9 +373,33 @@ class IntegrityLive:
         out["bias_bank"] = _row(
             name, sample, t_s, value, self.spec.bias_bank.declare, float(report.bias_m[best])
         )
+        self._past.append((list(snap.names), *_scores(raw, h, var, ~gone)))
+        del self._past[:-MEMORY]
         if self.respond.bias:
             found = self._bank.correction_m(report)
-            self._shift = {n: float(b) for n, b in zip(self._bank_names, found) if b}
+            before, self._shift = self._shift, {n: float(b) for n, b in zip(self._bank_names, found) if b}
+            self._new_bias = {n: b for n, b in self._shift.items() if not before}
+
+    def _undo(self, log: NavigatorLog | None) -> np.ndarray | None:
+        """What a bias that was just identified has done to the filter's state since its onset, with the sign reversed.
+
+        Onset by cumulative sum: the epoch from which the log-likelihood ratio to now, sum of mu (W r)_i - mu^2 W_ii / 2,
+        is largest. The state it polluted follows c <- (I - K H) phi c + K_i mu.
+        """
+        if not self._new_bias or log is None or log.count == 0:
+            return None
+        (name, mu), self._new_bias = next(iter(self._new_bias.items())), {}
+        ratio = []
+        for names, wr, w in reversed(self._past[-min(log.count, log.length) :]):
+            at = names.index(name) if name in names else -1
+            ratio.append(mu * wr[at] - 0.5 * mu * mu * w[at] if at >= 0 else 0.0)
+        age = 1 + int(np.argmax(np.cumsum(ratio)))
+        part, row = log.log(age), log.names.index(name)
+        c = np.zeros(log.dx.size)
+        for e in range(age):
+            c = part.phi[e] @ c if e else c
+            c = c + part.k[e] @ ((np.arange(part.r.shape[1]) == row) * mu * part.used[e] - part.h[e] @ c)
+        return -c
 
     def _protect(self, snap, h, var, sample, t_s, out) -> None:
         if self.spec.protection is None:
@@ -619,6 +650,16 @@ def _row(
     row = np.zeros(1, INTEGRITY)
     row[0] = name[:1].encode(), int(name[1:]), sample, t_s, value, threshold, estimate
     return row
+
+
+def _scores(
+    raw: np.ndarray, h: np.ndarray, var: np.ndarray, used: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """(W r, diagonal of W) of the parity weight W over the used ranges, zero elsewhere."""
+    wr, diag = np.zeros(raw.size), np.zeros(raw.size)
+    w = _parity(h[used], var[used])
+    wr[used], diag[used] = w @ raw[used], np.diag(w)
+    return wr, diag
 
 
 def _rank(h: np.ndarray) -> int:

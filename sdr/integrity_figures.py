@@ -99,11 +99,10 @@ def stanford(h5: h5py.File, channels: dict[str, h5py.Group], directory: Path) ->
         return None
     path = directory / "stanford.png"
     parts = levels_and_errors(solution, true, level)
+    top = max(max(limit, *error, *bound[np.isfinite(bound)]) for error, bound, limit in parts.values())
+    reach = min(1.1 * top, 4 * max(limit for _, _, limit in parts.values()))
     with figure(path, "Stanford diagram: protection level against error", rows=2, size=(6, 9)) as axes:
         for ax, (name, (error, bound, limit)) in zip(axes, parts.items()):
-            finite = np.isfinite(bound)
-            reach = 1.1 * max(limit, float(np.max(error)), float(np.max(bound[finite], initial=0.0)))
-            reach = min(reach, 4 * limit)
             ax.plot(error, np.minimum(bound, reach), ".", ms=3)
             ax.plot([0, reach], [0, reach], "k", lw=0.8)
             ax.axhline(limit, color="C3", lw=0.8)
