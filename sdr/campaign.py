@@ -35,7 +35,8 @@ from monitors.threshold import AnalyticNull, EmpiricalNull, GaussianNull, Pareto
 from sdr.scenario import validate
 from sdr.watch import Detector, one_blas_thread
 from signals.constants import METRES_PER_CHIP, WAVELENGTH_M
-from tracking.correlator_model import Twin, TwinCW, TwinNBI
+from signals.modulation import SIGNALS
+from tracking.correlator_model import Twin, TwinCW, TwinNBI, code_spectrum
 from tracking.twin_kernels import hatch_smooth
 
 MAX_POINTS = 20_000
@@ -287,7 +288,7 @@ class Campaign:
         if twin.get("multipath") == "none":
             twin["multipath"] = None
         if jammer and jammer.get("kind") != "none":
-            twin["jammers"] = [self._power(jammer, where)]
+            twin["jammers"] = [self._searched(self._power(jammer, where), twin, where)]
         return validate(Twin, twin, where)
 
     def _power(self, jammer: dict[str, Any], where: str) -> dict[str, Any]:
@@ -300,6 +301,28 @@ class Campaign:
             raise ValueError(f"{where}: jammer.power_dbw needs signal_dbw, the power of the signal itself")
         rest = {k: v for k, v in jammer.items() if k != "power_dbw"}
         return rest | {"js_db": jammer["power_dbw"] - self.spec.signal_dbw}
+
+    def _searched(self, jammer: dict[str, Any], twin: dict[str, Any], where: str) -> dict[str, Any]:
+        """``search_hz``: put the jammer on the strongest line within that span; ``bandwidth_hz`` = 0 is a CW."""
+        jammer = dict(jammer)
+        if "bandwidth_hz" in jammer and jammer["bandwidth_hz"] == 0:
+            del jammer["bandwidth_hz"]
+            jammer["kind"] = "CW"
+        span_hz = jammer.pop("search_hz", None)
+        if span_hz is None or jammer["kind"] != "CW":
+            return jammer
+        if jammer.get("freq_hz") is None:
+            raise ValueError(f"{where}: jammer.search_hz looks about freq_hz + offset_hz; give freq_hz")
+        period_s = SIGNALS[twin["signal"]].code_period_s
+        low, high = (
+            (jammer["freq_hz"] + jammer.get("offset_hz", 0.0) + d * span_hz) * period_s for d in (-0.5, 0.5)
+        )
+        k = np.arange(math.ceil(low), math.floor(high) + 1)
+        if not len(k):
+            raise ValueError(f"{where}: no code line within jammer.search_hz = {span_hz:g} Hz")
+        level = np.abs(code_spectrum(twin["signal"], twin["prn"], k, twin.get("waveform")))
+        del jammer["freq_hz"]
+        return jammer | {"line": int(k[np.argmax(level)]), "offset_hz": 0.0}
 
     def _check_points(self) -> None:
         spec = self.spec

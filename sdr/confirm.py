@@ -1,0 +1,216 @@
+"""A campaign point once more, on IF samples: the same jammer phase and echoes, the receiver's own channel.
+
+The trial's seed decides CW phase and echoes as in the twin; noise and data bits are drawn anew from it. A tracking
+channel follows the samples, and the monitors, trained as in the campaign, see its taps. Twin and samples are then
+compared second by second.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from monitors.batch import sum_dumps, trial_seed
+from sdr.campaign import (
+    Campaign,
+    _line_offset_hz,
+    _span,
+    _trained,
+    fit_thresholds,
+    load,
+    quiet_statistics,
+)
+from sdr.jobs import _progress
+from sdr.watch import one_blas_thread
+from signals.codes import primary_code
+from signals.constants import CHIP_RATE_HZ
+from tracking.channel import STATE_LOCKED, TrackingSpec
+from tracking.correlator_model import Twin, TwinCW, _cw_rows, _keys
+from tracking.records import ACQUISITION
+
+FS_HZ = 5.0037e6
+"""A rate whose aliases of the chip spectrum keep the lines' amplitudes within 1 % over the code phase."""
+SLAB_S = 0.1
+LIMIT_S = 60.0
+"""Length of signal that is synthesised at most."""
+Z_AGREE = 4.0
+
+
+def confirm(name: str, point: int, *, overrides: Sequence[str] = (), quiet: bool = False) -> dict[str, Any]:
+    """Compare point ``point`` of a campaign on samples with the twin; the command's JSON object."""
+    campaign = load(name, tuple(overrides))
+    if not 0 <= point < len(campaign.points):
+        raise ValueError(
+            f"--confirm {point}: '{campaign.spec.name}' has points 0 to {len(campaign.points) - 1}"
+        )
+    twin = campaign.points[point]
+    count, spacing = _confirmable(campaign, twin)
+    T = twin.integration_s
+    settle = campaign.spec.trial.settle_epochs
+    epochs = min(campaign.spec.trial.epochs, max(50, round(LIMIT_S / T) - settle))
+    group = campaign.group[point]
+    values = quiet_statistics(campaign.text, group, 0, campaign.spec.threshold.trials)
+    limits = fit_thresholds(campaign, group, values)["threshold"]
+    runs = _trained(campaign.text, group)
+    seed = trial_seed(campaign.spec.seeds.evaluation, point, 0)
+    with one_blas_thread():
+        model = twin.start(seed)(settle + epochs)
+    t_s, corr = _on_samples(twin, seed, (settle + epochs) * T, count, spacing, quiet)
+    rows = []
+    for i, (monitor, run) in enumerate(runs.items()):
+        with one_blas_thread():
+            a = _series(run, model[0]["t_s"][settle:], model[1][settle:], twin)
+            late = t_s >= settle * T
+            b = _series(run, t_s[late], corr[late], twin)
+        rows.append({"monitor": monitor, "threshold": float(limits[i])} | _compare(a, b, float(limits[i])))
+    result = {
+        "name": campaign.spec.name, "point": point, "axes": campaign.settings[point], "fs_hz": FS_HZ,
+        "duration_s": (settle + epochs) * T, "agree": all(r["agree"] for r in rows), "monitors": rows,
+    }  # fmt: skip
+    result["text"] = _text(result)
+    return result
+
+
+def _confirmable(campaign: Campaign, twin: Twin) -> tuple[int, float]:
+    """Number and spacing of the taps; ValueError for what the sample path does not make."""
+    taps = twin.tap_array_chips
+    step = np.diff(taps)
+    if twin.signal != "L1CA" or campaign.spec.dumps != 1:
+        raise ValueError("--confirm: samples are made for L1CA with dumps = 1 only; choose such a point")
+    if twin.dynamics.at(np.array([1.0]))[1].any() or twin.dynamics.jerk_mps3:
+        raise ValueError("--confirm: a point with dynamics is not made on samples; choose one without")
+    if any(not isinstance(j, TwinCW) for j in twin.jammers):
+        raise ValueError("--confirm: samples are made for CW jammers; choose such a point")
+    if len(taps) % 2 == 0 or not np.allclose(step, step[0]) or not np.allclose(taps, -taps[::-1]):
+        raise ValueError("--confirm: the taps must be evenly spaced about zero")
+    return len(taps), float(step[0])
+
+
+def _on_samples(twin: Twin, seed: Any, duration_s: float, count: int, spacing: float, quiet: bool) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Mid-times and taps (prompt = 1 at the signal's amplitude) of the locked integrations of one channel."""
+    samples = _Samples(twin, seed)
+    loops = {
+        "integration_ms": round(twin.integration_s * 1e3), "early_late_space_chips": twin.early_late_space_chips,
+        "pll_order": twin.pll_order, "pll_bw_hz": twin.pll_bandwidth_hz, "dll_bw_hz": twin.dll_bandwidth_hz,
+        "code_discriminator": twin.code_discriminator, "taps": {"count": count, "spacing_chips": spacing},
+        "carrier_discriminator": twin.carrier_discriminator,
+    }  # fmt: skip
+    tracker = TrackingSpec.model_validate({"l1ca": loops}).start(FS_HZ, 0.0)
+    start = np.zeros((), ACQUISITION)
+    start["signal"], start["prn"], start["cn0_dbhz"], start["acquired"] = (
+        b"L1CA",
+        twin.prn,
+        twin.cn0_dbhz,
+        True,
+    )
+    c = tracker.add(start)
+    t_s, out = [], []
+    n = round(SLAB_S * FS_HZ)
+    total = math.ceil(duration_s * FS_HZ / n)
+    with _progress("samples", total, quiet) as advance:
+        for k in range(total):
+            epochs, counts, corr = tracker.process(k * n, samples.read(k * n, n))
+            e, z = epochs[c, : counts[c]], corr[c, : counts[c], :count]
+            locked = e["state"] == STATE_LOCKED
+            t_s.append((e["sample_index"][locked] + 0.5 * e["n_samples"][locked]) / FS_HZ)
+            out.append(z[locked] / samples.amplitude)
+            advance(k + 1)
+    t, z = np.concatenate(t_s), np.concatenate(out)
+    if not len(t):
+        raise ValueError(
+            "--confirm: the channel did not lock on the samples; the jammer is too strong for this point"
+        )
+    return t, z
+
+
+class _Samples:
+    """Signal, echoes, CW and noise of one trial; unit noise density of 1 per sample and component."""
+
+    def __init__(self, twin: Twin, seed: Any) -> None:
+        self.twin = twin
+        _, symbol, _, rng, echo_seed, _ = _keys(seed)
+        self.cws = _cw_rows(twin.model_copy(update={"fs_hz": None}), rng)
+        self.echoes = twin.multipath.start(echo_seed) if twin.multipath else None
+        fresh = np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, 99))
+        self.rng = np.random.Generator(np.random.Philox(fresh))
+        self.bits = np.random.default_rng(int(symbol)).integers(0, 2, 100_000) * 2.0 - 1.0
+        self.chips = primary_code("L1CA", twin.prn).astype(np.float32)
+        # C/N0 = A^2 fs / (2 sigma^2), sigma = 1.
+        self.amplitude = math.sqrt(2.0 * 10 ** ((twin.cn0_dbhz - twin.loss_db) / 10) / FS_HZ)
+
+    def read(self, n0: int, n: int) -> np.ndarray:
+        """Samples n0 .. n0 + n - 1, float32 (2, n)."""
+        t = (n0 + np.arange(n)) / FS_HZ
+        z = self._code(t, 0.0).astype(np.complex128)
+        if self.echoes is not None and self.echoes.n_echo:
+            z += self._echo(n0, n, t)
+        for f, rate, phase, ratio, start, end in self.cws.tolist():
+            turn = phase + f * t + 0.5 * rate * t * t
+            z += ratio * np.exp(2j * np.pi * (turn - np.floor(turn))) * ((t >= start) & (t < end))
+        noise = self.rng.standard_normal((2, n), np.float32)
+        return (self.amplitude * np.stack([z.real, z.imag]) + noise).astype(np.float32)
+
+    def _code(self, t: np.ndarray, delay_s: Any) -> np.ndarray:
+        x = CHIP_RATE_HZ * (t - delay_s) + self.twin.code_phase_chips
+        chip = np.floor(x).astype(np.int64)
+        return self.chips[chip % 1023] * self.bits[chip // 20460]
+
+    def _echo(self, n0: int, n: int, t: np.ndarray) -> np.ndarray:
+        """Echoes with gain and delay held for a millisecond."""
+        step = 1e-3
+        first = math.floor(n0 / FS_HZ / step)
+        gain, delay_s = self.echoes.series((first + 0.5) * step, step, math.ceil(n / FS_HZ / step) + 2)
+        at = np.floor(t / step).astype(np.int64) - first
+        total = np.zeros(n, np.complex128)
+        for g, d in zip(gain, np.asarray(delay_s)):
+            total += g[at] * self._code(t, d[at])
+        return total
+
+
+def _series(run: Any, t_s: np.ndarray, corr: np.ndarray, twin: Twin) -> tuple[np.ndarray, np.ndarray]:
+    """Mid-times and values of a monitor on a series of epochs, those near the line or of a noise-like jammer."""
+    s = run.fresh()(sum_dumps(corr, 1))
+    middle = np.maximum(s["epoch"] - _span(run) // 2, 0)
+    t = t_s[middle]
+    if not twin.jammers:
+        return t, s["value"]
+    near = np.abs(_line_offset_hz(twin, t)) * twin.integration_s < 1.0
+    return t[near], s["value"][near]
+
+
+def _compare(a: tuple, b: tuple, threshold: float) -> dict[str, Any]:
+    """Means over whole seconds, paired: statistic and share of misses."""
+    both = sorted(set(np.floor(a[0]).astype(int)) & set(np.floor(b[0]).astype(int)))
+    if len(both) < 5:
+        raise ValueError(
+            "--confirm: fewer than 5 s of the trial are near a line and locked; lengthen trial.epochs"
+        )
+    mean = lambda s, f: np.array([f(s[1][np.floor(s[0]) == k]).mean() for k in both])  # noqa: E731
+    out: dict[str, Any] = {"seconds": len(both)}
+    for key, f in (("statistic", lambda v: v), ("missed", lambda v: (v < threshold).astype(float))):
+        x, y = mean(a, f), mean(b, f)
+        d = y - x
+        # A misses' rate that both sides hold at a few per thousand cannot show a scatter of its own.
+        error = max(float(d.std(ddof=1)) / math.sqrt(len(d)), 1e-3 if key == "missed" else 1e-9)
+        out |= {
+            f"{key}_twin": float(x.mean()),
+            f"{key}_samples": float(y.mean()),
+            f"{key}_z": float(d.mean() / error),
+        }
+    out["agree"] = abs(out["statistic_z"]) < Z_AGREE and abs(out["missed_z"]) < Z_AGREE
+    return out
+
+
+def _text(result: dict[str, Any]) -> str:
+    rows = [
+        f"{result['name']}, point {result['point']}: {result['duration_s']:g} s on samples of {FS_HZ / 1e6:g} MHz against the twin"
+    ]
+    for r in result["monitors"]:
+        rows.append(
+            f"  {r['monitor']:16} statistic {r['statistic_samples']:.3f} (twin {r['statistic_twin']:.3f}, z {r['statistic_z']:+.1f}), "
+            f"missed {r['missed_samples']:.3f} (twin {r['missed_twin']:.3f}, z {r['missed_z']:+.1f}): "
+            + ("agree" if r["agree"] else "DISAGREE")
+        )
+    rows.append("twin and samples agree" if result["agree"] else "twin and samples DISAGREE")
+    return "\n".join(rows)
