@@ -214,7 +214,7 @@ class Steering:
             self.active[i], self.slot[i], self.name[i] = True, index, (signal, prn)
             self.second[i] = float(system != self._reference)
             self.period_s[i], self.which[i] = (1e-3, 0) if system == "G" else (4e-3, 1)
-            self.filter.power[i] = 0.0
+            self.filter.power[i], self.inflate[i] = 0.0, 1.0
             self._set_orbit(i, newest[system, prn])
             self.filter.rho[i] = 2.2e7 + self.filter.clock()[0]
             self._next_refresh = 0
@@ -226,6 +226,15 @@ class Steering:
     def drop(self, i: int):
         """Leave channel slot i to its own loops."""
         self.active[i], self.name[i] = False, None
+
+    def weaken(self, signal: str, prn: int, factor: float) -> bool:
+        """Multiply the measurement variance of one satellite from the next epoch on (a monitor's flag); False: not steered."""
+        if not factor > 0.0:
+            raise ValueError(f"factor = {factor:g}: a variance is multiplied by something above zero")
+        if (signal, prn) not in self.name:
+            return False
+        self.inflate[self.name.index((signal, prn))] = factor
+        return True
 
     def refresh(self, ephemerides):
         """Newest ephemerides, atmosphere and elevation of all channels."""

@@ -12,6 +12,10 @@ from nav.steering import Sensors, Steering
 from nav.ultratight import Filter, Kinematic, SteeringSpec, discriminator_table, nominal_of, start_covariance
 from sdr.uttwin import Policy, Sky, Trial, batch, drive, summary
 from sdr.uttwin_kernels import correlate
+from signals.constants import C_MPS, CHIP_RATE_HZ, METRES_PER_CHIP, WAVELENGTH_M
+from signals.trajectory import HighDynamics
+from tracking.lock import STATE_LOCKED
+from tracking.records import EPOCH
 
 T_S = 0.02
 POS = np.array([1_070_000.0, -4_450_000.0, 4_428_000.0])
@@ -125,6 +129,46 @@ def test_prediction_is_that_of_the_riss_spec(model):
     assert p[:-1, :-1] == pytest.approx(q, rel=1e-9, abs=1e-18)
 
 
+@pytest.mark.parametrize("period_s", [1e-3, 4e-3])
+def test_nco_state_is_the_point_of_linearisation(period_s):
+    # An NCO 3 m and 0.4 m/s above the prediction, discriminators that see the signal 5 m and 0.1 m/s above the NCO.
+    fs_hz, sample, rx_ms, rx_frac_s = 4e6, 400_000, 123_457, 3.1e-4
+    rho, rate, accel = np.array([2.3e7]), np.array([-500.0]), np.array([2.0])
+    e = np.zeros((1, 1), EPOCH)
+    r = e[0, 0]
+    r["state"], r["n_samples"], r["sample_index"] = STATE_LOCKED, 80_000, sample - 85_000
+    dt = -85_000 / fs_hz
+    t = (rx_ms % 4) * 1e-3 + rx_frac_s + dt
+    nco = rho[0] + rate[0] * dt + 0.5 * accel[0] * dt**2 + 3.0
+    r["code_phase_chips"] = (t - nco / C_MPS) % period_s * CHIP_RATE_HZ
+    r["doppler_hz"] = -(rate[0] + accel[0] * dt + 0.4) / WAVELENGTH_M
+    r["doppler_rate_hz_s"] = -accel[0] / WAVELENGTH_M
+    r["code_error_chips"], r["freq_error_hz"] = -5.0 / METRES_PER_CHIP, -0.1 / WAVELENGTH_M
+    out = [np.zeros(1) for _ in range(5)]
+    seen = np.zeros(1, np.int64)
+    kernels.read_epochs(
+        e, np.ones(1, np.int64), np.zeros(1, np.int64), np.ones(1, np.bool_), np.array([period_s]), sample, fs_hz, rx_frac_s,
+        rx_ms, rho, rate, accel, np.zeros((1, 1, 4)), np.zeros(1, np.int64), np.zeros((1, kernels.N_CN0)), 0.1, 1.0, *out, seen,
+    )  # fmt: skip
+    code_m, rate_mps, off_m, off_mps, span_s = (float(a[0]) for a in out)
+    assert (code_m, rate_mps) == pytest.approx((5.0, 0.1), rel=1e-6)
+    # 0.4 m/s for half an integration adds 4 mm.
+    assert off_m == pytest.approx(3.0 + 0.4 * 0.01, abs=1e-4)
+    assert off_mps == pytest.approx(0.4, abs=1e-6)
+    assert (span_s, seen[0]) == (0.02, 1)
+    table, row = discriminator_table("L1CA", 0.5)[None], np.empty(4)
+    kernels.look_up(table[0], 300.0 * T_S, row)
+    z, var, used, gains = np.zeros(2), np.zeros(2), np.zeros(2, np.bool_), (np.zeros(1), np.zeros(1))
+    kernels.weigh(
+        *out, seen, np.array([300.0]), np.ones(1), table, np.zeros(1, np.int64), 0.0, 0.0, z, var, used, *gains
+    )
+    assert 0.7 < row[0] < 0.99
+    # What the discriminator shows, less what it would show if the prediction were true: -gain x (NCO - predicted).
+    assert z == pytest.approx([5.0 + row[0] * off_m, 0.1 + row[2] * off_mps], rel=1e-6)
+    assert var == pytest.approx([row[1] * METRES_PER_CHIP**2, row[3] * (WAVELENGTH_M / 0.01) ** 2])
+    assert (gains[0][0], gains[1][0]) == (row[0], row[2])
+
+
 # -- the twin ---------------------------------------------------------------------------------------------------
 
 
@@ -184,6 +228,54 @@ def test_results_depend_on_the_seed_alone(sky):
     two = batch(sky, Trial(js_db=40.0), SteeringSpec(mode="vector"), 2, seed=9)
     assert np.array_equal(one, two, equal_nan=True)
     assert not np.array_equal(one[0], one[1])
+
+
+def test_high_dynamics_hold_at_a_bandwidth_at_which_own_loops_do_not():
+    # Seeds 000 and 002: sinusoidal accelerations, here 3 to 6 g at 36 dB-Hz. A loop of 1 Hz lags by a / wn^2 = 0.27 a (m): off
+    # the frequency discriminator at 60 m/s^2 swings; the filter knows the acceleration from its IMU.
+    motion = HighDynamics(acc_ned_mps2=(60.0, 50.0, 30.0)).start(45.0)
+    sky = Sky(45.0, motion)
+    trial = Trial(
+        cn0_dbhz=36.0, jam_s=(15.0, 45.0), imu=ImuSpec(grade="tactical", attitude="aircraft"), fll_hz=1.0
+    )
+    aided = batch(sky, trial, SteeringSpec(mode="ultra_tight", model="ecef17"), 3, seed=1)
+    own = batch(sky, trial, SteeringSpec(), 3, seed=1)
+    s = summary(aided, trial)
+    assert np.all(aided[:, 150:, 11] == 8)
+    assert np.median(s["rms_jam_2d_m"]) < 1.5
+    assert np.median(s["rms_jam_speed_mps"]) < 0.2
+    assert summary(own, trial)["lost"].min() >= 2
+
+
+def test_a_sick_channel_is_left_out_and_moves_nothing():
+    model = Kinematic()
+    x, n = _nominal(model), 9
+    p = start_covariance(model, x)
+    rng = np.random.default_rng(4)
+    los = rng.standard_normal((8, 3))
+    los /= np.linalg.norm(los, axis=1, keepdims=True)
+    h, z = np.zeros((16, n)), np.zeros(16)
+    tp, tv, k, s = np.empty((3, n)), np.empty((3, n)), np.zeros((n, 16)), np.zeros((16, 16))
+    f, phi, qd, p0 = (np.zeros((n, n)) for _ in range(4))
+    dx, power, truth = np.zeros(n), np.zeros((8, kernels.N_CN0)), x.copy()
+    ones, far = np.ones(8), 0.0
+    for _ in range(500):
+        for y, cov in ((truth, p.copy()), (x, p)):
+            kernels.predict(
+                3, y, cov, np.zeros((1, 7)), T_S, 1.0, np.zeros(3), ut.extended_q(model, x), f, phi, qd
+            )
+        kernels.rows(3, x, n, los, np.zeros(8), ones, ones, tp, tv, h)
+        z[:8] = -los @ (truth - x)[:3] + (truth - x)[6] + rng.standard_normal(8)
+        z[8:] = -los @ (truth - x)[3:6] + (truth - x)[7] + 0.1 * rng.standard_normal(8)
+        z[2] += 60.0
+        var, used = np.r_[np.ones(8), np.full(8, 0.01)], np.ones(16, np.bool_)
+        kernels.filter_update(3, x, p, h, z, var, used, power, 4.0, k, s, p0, dx)
+        far = max(far, np.linalg.norm((truth - x)[:3]))
+    assert not used[2]
+    assert used[:2].all()
+    # 60 m would move a least-squares position by tens of metres; claimed sigma here is some 0.3 m.
+    assert far < 5 * np.sqrt(np.trace(p[:3, :3])) + 2.0
+    assert np.linalg.norm((truth - x)[:3]) < 5 * np.sqrt(np.trace(p[:3, :3]))
 
 
 # -- the run ----------------------------------------------------------------------------------------------------
