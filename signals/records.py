@@ -138,8 +138,7 @@ FAULT_TRUTH = np.dtype(
         ("system", "S1"),  # empty: all satellites
         ("prn", "i4"),
         ("on", "?"),
-        # added to the range that the code shows (a spoofer: its range minus the genuine one)
-        ("code_m", "f8"),
+        ("code_m", "f8"),  # added to the code's range (a spoofer: its range minus the genuine one)
         ("carrier_m", "f8"),
         ("level_db", "f8"),  # added to the satellite's C/N0 (a spoofer: its power over the genuine one)
     ]
