@@ -40,8 +40,8 @@ COMMON_RATES_HZ = tuple(
         12.0,
         12.5,
         16.0,
+        *(16.3676, 16.368, 20.0, 20.46, 24.0, 25.0, 26.0, 30.0, 38.192, 40.0, 50.0),
     )
-    + (16.3676, 16.368, 20.0, 20.46, 24.0, 25.0, 26.0, 30.0, 38.192, 40.0, 50.0)
 )
 """Rates that front ends and published data sets use; tried when none is declared."""
 FORMATS_BY_BYTES = ("ci8", "ci16", "cf32", "ri8", "ri16")
