@@ -41,7 +41,7 @@ def meanings(cls: type) -> dict[str, str]:
             continue
         source = textwrap.dedent(inspect.getsource(base))
         lines = source.splitlines()
-        body = ast.parse(source).body[0].body  # type: ignore[attr-defined]
+        body = ast.parse(source).body[0].body  # type: ignore[attr-defined]  # of a class
         for node, after in zip(body, [*body[1:], None]):
             if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
                 text = _string(after) or _comment(lines, node)
@@ -56,7 +56,7 @@ def _string(node: ast.AST | None) -> str:
 
 
 def _comment(lines: list[str], node: ast.AST) -> str:
-    last = lines[node.end_lineno - 1][node.end_col_offset :]  # type: ignore[attr-defined]
+    last = lines[node.end_lineno - 1][node.end_col_offset :]  # type: ignore[attr-defined]  # of parsed source
     return last.partition("#")[2].strip().removeprefix("noqa").strip()
 
 
