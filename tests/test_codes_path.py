@@ -30,4 +30,9 @@ def test_damaged_table_is_refused(codes, tmp_path):
     at = text.index("E1C,4,") + 6
     table.write_text(text[:at] + ("0" if text[at] != "0" else "1") + text[at + 1 :])
     with pytest.raises(ValueError, match="E1C PRN 4 is damaged"):
-        jobs.run("demo-e1", output=tmp_path / "c.h5", overrides=[*SHORT, f"receiver.codes_path={codes}"], quiet=True)
+        jobs.run(
+            "demo-e1",
+            output=tmp_path / "c.h5",
+            overrides=[*SHORT, f"receiver.codes_path={codes}"],
+            quiet=True,
+        )
