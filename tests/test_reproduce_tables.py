@@ -1,4 +1,4 @@
-"""The comparison-table helper, and the quick form of the three estimation reproductions."""
+"""The comparison tables, and the quick form of the three estimation reproductions."""
 
 import csv
 import json
