@@ -160,7 +160,18 @@ def test_nco_state_is_the_point_of_linearisation(period_s):
     kernels.look_up(table[0], 300.0 * T_S, row)
     z, var, used, gains = np.zeros(2), np.zeros(2), np.zeros(2, np.bool_), (np.zeros(1), np.zeros(1))
     kernels.weigh(
-        *out, seen, np.array([300.0]), np.ones(1), table, np.zeros(1, np.int64), 0.0, 0.0, z, var, used, *gains
+        *out,
+        seen,
+        np.array([300.0]),
+        np.ones(1),
+        table,
+        np.zeros(1, np.int64),
+        0.0,
+        0.0,
+        z,
+        var,
+        used,
+        *gains,
     )
     assert 0.7 < row[0] < 0.99
     # What the discriminator shows, less what it would show if the prediction were true: -gain x (NCO - predicted).
