@@ -46,7 +46,7 @@ def integrity(h5: h5py.File, channels: dict[str, h5py.Group], directory: Path) -
 
 
 def _errors(h5: h5py.File, ax: Any) -> None:
-    solution = h5["navigation/solution"][:] if "navigation/solution" in h5 else np.empty(0)
+    solution: Any = h5["navigation/solution"][:] if "navigation/solution" in h5 else np.empty(0)
     if not len(solution):
         return
     solution = solution[solution["valid"]]
