@@ -303,12 +303,13 @@ class Campaign:
         return rest | {"js_db": jammer["power_dbw"] - self.spec.signal_dbw}
 
     def _searched(self, jammer: dict[str, Any], twin: dict[str, Any], where: str) -> dict[str, Any]:
-        """``search_hz``: put the jammer on the strongest line within that span; ``bandwidth_hz`` = 0 is a CW."""
+        """``bandwidth_hz`` = 0 is a CW; ``search_hz`` puts a CW on the strongest line within that span, and with
+        ``cross_hz_s`` lets it cross that line at this rate in the middle of the trial."""
         jammer = dict(jammer)
         if "bandwidth_hz" in jammer and jammer["bandwidth_hz"] == 0:
             del jammer["bandwidth_hz"]
             jammer["kind"] = "CW"
-        span_hz = jammer.pop("search_hz", None)
+        span_hz, rate_hz_s = jammer.pop("search_hz", None), jammer.pop("cross_hz_s", 0.0)
         if span_hz is None or jammer["kind"] != "CW":
             return jammer
         if jammer.get("freq_hz") is None:
@@ -322,7 +323,9 @@ class Campaign:
             raise ValueError(f"{where}: no code line within jammer.search_hz = {span_hz:g} Hz")
         level = np.abs(code_spectrum(twin["signal"], twin["prn"], k, twin.get("waveform")))
         del jammer["freq_hz"]
-        return jammer | {"line": int(k[np.argmax(level)]), "offset_hz": 0.0}
+        middle_s = (self.spec.trial.settle_epochs + 0.5 * self.spec.trial.epochs) * twin["integration_s"]
+        move = {"offset_hz": -rate_hz_s * middle_s, "rate_hz_s": rate_hz_s}
+        return jammer | {"line": int(k[np.argmax(level)]), **move}
 
     def _check_points(self) -> None:
         spec = self.spec

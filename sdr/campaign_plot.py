@@ -28,9 +28,10 @@ def plot(path: Path | str, directory: Path | None = None) -> list[Path]:
     with farm.read_rates(path) as h5:
         rates, trials = h5["campaign/rates"][:], h5["campaign/trials"][:]
         axes = json.loads(h5["campaign/points"].attrs["axes"])
+        cn0_dbhz = float(json.loads(h5.attrs["scenario"])["twin"]["cn0_dbhz"])
     drawn = [_rates(rates, axes, out), _curves(rates, trials, axes, out)]
     if {"jammer.bandwidth_hz", "jammer.offset_hz", "jammer.power_dbw"} <= set(axes[0]):
-        drawn.append(_mask(rates, trials, axes, out))
+        drawn.append(_mask(rates, trials, axes, cn0_dbhz, out))
     return [p for p in drawn if p is not None]
 
 
@@ -95,14 +96,15 @@ def _curves(rates: np.ndarray, trials: np.ndarray, axes: list[dict], out: Path) 
     return save_figure(fig, out, "p_md_curve")
 
 
-def mask_table(rates: np.ndarray, trials: np.ndarray, axes: list[dict]) -> list[dict[str, Any]]:
+def mask_table(
+    rates: np.ndarray, trials: np.ndarray, axes: list[dict], cn0_dbhz: float
+) -> list[dict[str, Any]]:
     """Per bandwidth: the worst offset, and the least power that costs 1 dB, loses lock, and is first detected.
 
-    "Worst" is the offset at which the least power costs 1 dB of C/N0 (then the most costly one).
+    "Worst" is the offset with the largest C/N0 loss summed over the powers, each counted up to 10 dB (lost: 10).
     """
     out = []
     first = trials[trials["monitor"] == 0]
-    quiet = np.max([np.mean(first["cn0_dbhz"][first["point"] == p]) for p in np.unique(first["point"])])
     monitors = list(dict.fromkeys(r["monitor"].decode() for r in rates))
     for bandwidth in sorted({a["jammer.bandwidth_hz"] for a in axes}):
         cells: dict[float, list] = {}
@@ -112,13 +114,13 @@ def mask_table(rates: np.ndarray, trials: np.ndarray, axes: list[dict]) -> list[
                 missed = {r["monitor"].decode(): float(r["rate"]) for r in rates if r["point"] == p}
                 entry = (
                     a["jammer.power_dbw"],
-                    quiet - float(np.mean(rows["cn0_dbhz"])),
+                    cn0_dbhz - float(np.mean(rows["cn0_dbhz"])),
                     float(np.mean(rows["lost"])),
                     missed,
                 )
                 cells.setdefault(a["jammer.offset_hz"], []).append(entry)
         least = lambda rows, test: min((r[0] for r in rows if test(r)), default=None)  # noqa: E731
-        worst = max(cells, key=lambda o: sum(r[1] for r in cells[o]))
+        worst = max(cells, key=lambda o: sum(10.0 if r[2] > 0.5 else min(r[1], 10.0) for r in cells[o]))
         rows = sorted(cells[worst], key=lambda r: r[0])
         out.append({
             "bandwidth_hz": bandwidth, "worst_offset_hz": worst, "mask_dbw": float(mask_dbw(bandwidth)),
@@ -128,8 +130,8 @@ def mask_table(rates: np.ndarray, trials: np.ndarray, axes: list[dict]) -> list[
     return out
 
 
-def _mask(rates: np.ndarray, trials: np.ndarray, axes: list[dict], out: Path) -> Path:
-    table = mask_table(rates, trials, axes)
+def _mask(rates: np.ndarray, trials: np.ndarray, axes: list[dict], cn0_dbhz: float, out: Path) -> Path:
+    table = mask_table(rates, trials, axes, cn0_dbhz)
     first = trials[trials["monitor"] == 0]
     fig, panels = new_figure(1, 2, size=(12, 5))
     width = [max(t["bandwidth_hz"], 30.0) for t in table]
@@ -145,7 +147,6 @@ def _mask(rates: np.ndarray, trials: np.ndarray, axes: list[dict], out: Path) ->
     panels[0].legend(fontsize=7)
     strongest = sorted({a["jammer.power_dbw"] for a in axes})
     power = strongest[len(strongest) // 2]
-    quiet = np.max([np.mean(first["cn0_dbhz"][first["point"] == p]) for p in np.unique(first["point"])])
     for t in table:
         points = [
             p
@@ -153,7 +154,7 @@ def _mask(rates: np.ndarray, trials: np.ndarray, axes: list[dict], out: Path) ->
             if axes[p]["jammer.bandwidth_hz"] == t["bandwidth_hz"] and axes[p]["jammer.power_dbw"] == power
         ]
         x = [axes[p]["jammer.offset_hz"] / 1e3 for p in points]
-        y = [quiet - np.mean(first["cn0_dbhz"][first["point"] == p]) for p in points]
+        y = [cn0_dbhz - np.mean(first["cn0_dbhz"][first["point"] == p]) for p in points]
         panels[1].plot(x, y, ".-", label=f"{t['bandwidth_hz']:g} Hz")
     panels[1].set(xlabel="offset (kHz)", ylabel="C/N0 loss (dB)", title=f"{power:g} dBW")
     panels[1].legend(fontsize=7)

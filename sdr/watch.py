@@ -161,8 +161,10 @@ class _Channel:
             settled = e["sample_index"] >= self._locked_at + self.spec.settle_s * self.fs_hz
             self._cn0 += e["cn0_dbhz"][settled].tolist() if self.threshold is None else []
             self._take(e[settled], corr[part][settled])
-            if sum(map(len, self._waiting)) * self.epoch_s >= BATCH_S:
-                out.append(self.batch())
+            # Always the same batches, however the samples were cut into slabs.
+            n = round(BATCH_S / self.epoch_s)
+            while sum(map(len, self._waiting)) >= n:
+                out.append(self.batch(n))
         return np.concatenate(out) if out else np.empty(0, MONITOR)
 
     def _take(self, epochs: np.ndarray, corr: np.ndarray) -> None:
@@ -182,12 +184,16 @@ class _Channel:
             self._waiting.append(corr)
             self._ends.append(ends)
 
-    def batch(self) -> np.ndarray:
-        """Train on, or test, what has come together -> MONITOR rows."""
+    def batch(self, n: int | None = None) -> np.ndarray:
+        """Train on, or test, the first ``n`` (all) of what has come together -> MONITOR rows."""
         if not self._waiting:
             return np.empty(0, MONITOR)
         corr, ends = np.concatenate(self._waiting), np.concatenate(self._ends)
-        self._waiting, self._ends = [], []
+        n = len(corr) if n is None else n
+        self._waiting, self._ends = [corr[n:]], [ends[n:]]
+        corr, ends = corr[:n], ends[:n]
+        if not len(corr):
+            return np.empty(0, MONITOR)
         if self.threshold is None:
             self._quiet.append(corr)
             if sum(map(len, self._quiet)) * self.epoch_s >= self.spec.training_s:
