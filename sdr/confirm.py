@@ -160,6 +160,7 @@ class _Samples:
         """Echoes with gain and delay held for a millisecond."""
         step = 1e-3
         first = math.floor(n0 / FS_HZ / step)
+        assert self.echoes is not None
         gain, delay_s = self.echoes.series((first + 0.5) * step, step, math.ceil(n / FS_HZ / step) + 2)
         at = np.floor(t / step).astype(np.int64) - first
         total = np.zeros(n, np.complex128)
