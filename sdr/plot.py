@@ -53,6 +53,7 @@ def plot(results: Path, directory: Path | None = None) -> list[Path]:
             _spectrum,
             _attack,
             _attacked_peak,
+            _monitors,
             integrity,
             stanford,
         ):
@@ -352,3 +353,48 @@ def _attacked_peak(h5: h5py.File, channels: dict[str, h5py.Group], directory: Pa
         ax.set(xlabel="tap offset (chip, early positive)", ylabel="amplitude (ADC levels)")
         ax.legend(fontsize=8)
     return path
+
+
+def _monitors(h5: h5py.File, channels: dict[str, h5py.Group], directory: Path) -> Path | None:
+    """Each live monitor's statistic over its threshold with its alarms, the jammers' truth, and the code error."""
+    if "monitors/thresholds" not in h5:
+        return None
+    limits = h5["monitors/thresholds"][:]
+    names = [n for n in dict.fromkeys(r["monitor"].decode() for r in limits) if n in h5["monitors"]]
+    path = directory / "monitors.png"
+    with figure(
+        path, "Monitors: statistic over threshold", rows=len(names) + 1, size=(9, 2 * len(names) + 2)
+    ) as axes:
+        for ax, name in zip(axes, names):
+            rows = h5[f"monitors/{name}"][:]
+            for limit in limits[limits["monitor"] == name.encode()]:
+                mine = rows[(rows["signal"] == limit["signal"]) & (rows["prn"] == limit["prn"])]
+                label = f"{limit['signal'].decode()} {limit['prn']}"
+                ax.plot(mine["t_s"], mine["value"] / limit["threshold"], lw=0.6, label=label)
+            ax.axhline(1.0, color="k", lw=0.8)
+            ax.set_ylabel(name)
+        if "monitors/alarms" in h5:
+            for alarm in h5["monitors/alarms"][:]:
+                if alarm["monitor"].decode() in names:
+                    ax = axes[names.index(alarm["monitor"].decode())]
+                    ax.axvspan(alarm["start_s"], alarm["end_s"], color="r", alpha=0.1)
+        _code_errors(h5, channels, axes[-1])
+        if "truth/jammers" in h5:
+            truth = h5["truth/jammers"][:]
+            for ax in axes:
+                for t_s in truth["t_s"][1:][np.diff(truth["on"].astype(int)) != 0]:
+                    ax.axvline(t_s, color="r", ls="--", lw=0.8)
+        axes[0].legend(ncol=8, fontsize=6)
+        axes[-1].set_xlabel("time (s); dashed: a jammer starts or ends, shaded: alarm")
+    return path
+
+
+def _code_errors(h5: h5py.File, channels: dict[str, h5py.Group], ax: Any) -> None:
+    for group in channels.values():
+        attrs = group["epochs"].attrs
+        truth = satellite_truth(h5, b"G" if attrs["signal"] == "L1CA" else b"E", attrs["prn"])
+        if len(truth) > 1:
+            errors = tracking_errors(group["epochs"][:], truth, attrs["fs_hz"], attrs["signal"])
+            late = errors["t_s"] > errors["t_s"][0] + 5.0 if len(errors["t_s"]) else slice(None)
+            ax.plot(errors["t_s"][late], errors["code_m"][late], lw=0.5)
+    ax.set_ylabel("code error (m)")
