@@ -235,7 +235,7 @@ def test_noise_goes_into_the_filter(sky):
     """Ranges noisier by 10: with ALS acting the mean NIS is within 20 % of its degrees of freedom, without it 50 or more."""
     monitors = {"als": {"window_epochs": 60, "settle_epochs": 15}}
     a, off, _, _, _ = fly(sky, EKF, monitors, n=300, sigma_m=15.0)
-    b, on, run, _, _ = fly(sky, EKF, monitors, {"noise": "als"}, n=300, sigma_m=15.0)
+    b, on, _, _, _ = fly(sky, EKF, monitors, {"noise": "als"}, n=300, sigma_m=15.0)
     late = a["t_s"] > T0 + 35
     ratio = [x["chi2"][late].sum() / x["dof"][late].sum() for x in (a, b)]
     # Half of the rows are rates, which stay as they are: (100 + 1) / 2.
@@ -266,7 +266,7 @@ def test_fallback_to_the_constellation_that_agrees(sky):
     assert len(galileo) >= 6
     fault = lambda t: {n: 60.0 * (1 + k) * (t >= 40) for k, n in enumerate(gps[:3])}  # noqa: E731
     _, off, _, _, _ = fly(sky, LEAST_SQUARES, {}, fault=fault, n=100)
-    solutions, on, run, rows, nav = fly(sky, LEAST_SQUARES, {}, {"fallback": True}, fault=fault, n=100)
+    solutions, on, _, _, nav = fly(sky, LEAST_SQUARES, {}, {"fallback": True}, fault=fault, n=100)
     late = solutions["t_s"] > 42
     assert rms(on[late]) < 0.2 * rms(off[late])
     assert np.all(solutions["n_used"][late] == len(galileo)) and set(nav.used) == set(galileo)
