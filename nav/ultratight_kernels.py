@@ -58,6 +58,10 @@ P_FAST, P_SLOW, N_FAST, WEIGHT, NIS_MEAN, CN0_HZ, SIGNAL = range(7)
 STRONG = 10.0
 """C/N0 T above which the signal's own power is learnt."""
 
+SLOW_HZ_S = 25.0
+"""Doppler rate below which a command keeps its frequency constant."""
+LEAD_S = 0.02
+"""From a command to the middle of the integrations it governs, on average, at 50 Hz and 20 ms."""
 TABLE_LOW_DB, TABLE_STEP_DB = -20.0, 0.5
 """Grid of the discriminator table: C/N0 T in dB; columns code gain, code variance (chips^2), frequency gain and
 variance of frequency x T / 2 (cycles^2)."""
@@ -505,8 +509,11 @@ def weigh(code_m, rate_mps, off_m, off_mps, span_s, seen, cn0, inflate, tables, 
 
 @njit(cache=True, nogil=True)
 def steer(active, slot, period_s, sample, rx_ms, rx_frac_s, rho, rate, accel, lead_s, commands):
-    """NCO commands from ``sample`` on: code phase, Doppler and its rate; ``lead_s`` after it the law is exact to
-    second order."""
+    """NCO commands from ``sample`` on: code phase, Doppler and its rate.
+
+    A slow rate is folded into the Doppler ``lead_s`` ahead, where the integrations that this command governs have their
+    middle: within ``SLOW_HZ_S`` that is exact to 0.25 Hz, and a carrier of constant frequency is cheaper to correlate.
+    """
     for c in range(active.size):
         if not active[c]:
             continue
@@ -517,6 +524,9 @@ def steer(active, slot, period_s, sample, rx_ms, rx_frac_s, rho, rate, accel, le
         cmd.code_phase_chips = (t - math.floor(t / period_s[c]) * period_s[c]) * CHIP_RATE_HZ
         cmd.doppler_hz = -rate[c] / WAVELENGTH_M
         cmd.doppler_rate_hz_s = -accel[c] / WAVELENGTH_M
+        if abs(cmd.doppler_rate_hz_s) < SLOW_HZ_S:
+            cmd.doppler_hz += lead_s * cmd.doppler_rate_hz_s
+            cmd.doppler_rate_hz_s = 0.0
 
 
 @njit(cache=True, nogil=True)
@@ -588,7 +598,7 @@ def navigation_epoch(model, x, p, sensors, dt_s, filter_s, rates, q_diag, limit,
         accel,
         los,
     )
-    steer(active, slot, period_s, sample, rx_ms, rx_frac_s, rho, rate, accel, 0.0, commands)
+    steer(active, slot, period_s, sample, rx_ms, rx_frac_s, rho, rate, accel, LEAD_S, commands)
     tracked = 0
     for c in range(count):
         tracked += seen[c] > 0

@@ -29,6 +29,8 @@ ENOUGH = 4
 """Satellites tracked below which everything is searched again and again."""
 SOLUTION_EVERY = 5
 """Steered positions are reported every so many navigation epochs."""
+DECODE_EVERY = 10
+"""Slabs whose symbols are decoded together while the channels are steered."""
 TAKE_EVERY = 25
 """New channels are put under command every so many navigation epochs."""
 RETRY_S = 1.0
@@ -89,6 +91,7 @@ class Receiver:
         self.searched: dict[str, list[int]] = {}
         self.position = 0
         self._week: int | None = None
+        self._held: list[tuple[np.ndarray, np.ndarray]] = []
         self._recent: list[tuple[int, np.ndarray]] = []
         self._lost: list[tuple[str, int]] = []
         self._next_search = self._next_retry = self._full_searches = self._turn = 0
@@ -121,7 +124,7 @@ class Receiver:
         # Searching comes first: a new channel starts with this slab, so that nothing of a short file is lost.
         found = self._search(n0, iq)
         epochs, counts, corr = self.tracker.process(n0, iq, self._commands())
-        self.telemetry.update()
+        self._decode()
         self.position = n_end
         rows = [(c, epochs[c, :n], corr[c, :n]) for c, n in enumerate(counts) if n]
         out = Outcome(n0, n_end, found, rows)
@@ -201,6 +204,7 @@ class Receiver:
             self.searched[signal] = sorted({*self.searched.get(signal, ()), *prns})
             rows = acquire(samples, first, self.fs_hz, self.source.if_hz, signal, prns, spec)
             for row in rows[rows["acquired"]]:
+                self._decode(at_once=True)  # before a channel changes hands
                 c = self.tracker.add(row)
                 self.channel_of[signal, int(row["prn"])] = c
                 self.telemetry.start(c)
@@ -243,6 +247,27 @@ class Receiver:
             sample, r["signal"], r["prn"], r["code_period"], [p for p, _ in reference], [t for _, t in reference],
             r["code_phase_chips"], r["doppler_hz"], r["carrier_phase_cycles"], r["cn0_dbhz"], r["lock_s"], slips,
         )  # fmt: skip
+
+    def _decode(self, at_once: bool = False) -> None:
+        """Feed the decoders; while steered, whose slabs are short, a few slabs at a time."""
+        tracker = self.tracker
+        if not self._held and (self.steering is None or self.steering.filter is None):
+            if not at_once:
+                self.telemetry.update()
+            return
+        if not at_once:
+            self._held.append((tracker.symbols, tracker.symbol_counts))
+        if len(self._held) >= DECODE_EVERY or (at_once and self._held):
+            counts = sum(n for _, n in self._held)
+            merged = np.zeros((len(counts), int(counts.max())), tracker.symbols.dtype)
+            at = np.zeros(len(counts), np.int64)
+            for symbols, n in self._held:
+                for c in np.flatnonzero(n):
+                    merged[c, at[c] : at[c] + n[c]] = symbols[c, : n[c]]
+                at += n
+            self._held.clear()
+            tracker.symbols, tracker.symbol_counts = merged, counts
+            self.telemetry.update()
 
     # -- steering: the hand-over back to tracking, one slab later -----------------------------------------------------
 

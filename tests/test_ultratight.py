@@ -180,6 +180,16 @@ def test_nco_state_is_the_point_of_linearisation(period_s):
     assert (gains[0][0], gains[1][0]) == (row[0], row[2])
 
 
+def test_gains_scale_the_rows():
+    model = RissSf()
+    x, n, los = _nominal(model), 10, np.eye(3)[:2]
+    tp, tv, h = np.empty((3, n)), np.empty((3, n)), np.zeros((2, 4, n))
+    for k, g in enumerate((1.0, 0.25)):
+        kernels.rows(1, x, n, los, np.array([0.0, 1.0]), np.full(2, g), np.full(2, 2 * g), tp, tv, h[k])
+    assert np.array_equal(h[1], 0.25 * h[0])
+    assert h[0, :, [7, 8, 9]].T.tolist() == [[1, 0, 0], [1, 0, 1], [0, 2, 0], [0, 2, 0]]
+
+
 # -- the twin ---------------------------------------------------------------------------------------------------
 
 
