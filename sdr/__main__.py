@@ -312,6 +312,31 @@ def campaign(
 
 
 @app.command
+def reproduce(
+    name: str,
+    /,
+    *,
+    output: Annotated[
+        Path | None, Parameter(name=["--output", "-o"], help="Directory for figures and tables.")
+    ] = None,
+    quick: Annotated[bool, Parameter(negative="", help="Short runs, wide intervals.")] = False,
+    seed: Annotated[int, Parameter(help="Root of all random numbers.")] = 1,
+    json: Json = False,
+) -> None:
+    """Run a published experiment again and compare: figures, a table, and verdicts.
+
+    NAME is ouzeau2008, abdelhafez-als, abdelhafez-bias, vanek1999 or karaim2020.
+    """
+    from sdr import reproduce as reproducer
+
+    result = reproducer.reproduce(name, output, quick=quick, seed=seed)
+    if json:
+        print(jsonlib.dumps(result["items"], allow_nan=False))
+    else:
+        _report("reproduce", result, False)
+
+
+@app.command
 def scenarios(*, json: Json = False) -> None:
     """List the built-in scenarios."""
     from sdr import scenario
