@@ -280,9 +280,9 @@ class BiasBankRun:
     def _threshold(self, dof: int) -> float:
         """Chi-square quantile at 1 - fit_p_false, kept per degree of freedom."""
         if dof not in self._limit:
-            from scipy.stats import chi2
+            from scipy.special import chdtri
 
-            self._limit[dof] = float(chi2.isf(self.spec.fit_p_false, dof))
+            self._limit[dof] = float(chdtri(dof, self.spec.fit_p_false))
         return self._limit[dof]
 
     def correction_m(self, report: BiasReport) -> np.ndarray:

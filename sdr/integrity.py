@@ -28,7 +28,7 @@ from monitors.integrity import Integrity, IntegrityRun
 from monitors.integrity import Respond as FilterRespond
 from monitors.noise_rmd import SCHEMES, NoiseRmd, window_variance
 from monitors.parallel_filters import ParallelFilters
-from monitors.protection import Protection, _horizontal_tail, _level, _vertical_tail, solution
+from monitors.protection import Protection, solution
 from nav.frames import geodetic_from_ecef, rotation_enu_to_ecef
 from nav.navigator import Navigator, Snapshot
 from nav.navlog import EXCLUDED_M2, REMEDY, NavigatorLog, Remedy
@@ -697,15 +697,35 @@ def _grown(spec: BiasBank, old, m: int):
     return run
 
 
-STEP = 1.01
+STEP = 1.03
 """Slopes are rounded up to this ratio, so that a level is computed once and not every epoch."""
+
+
+@lru_cache(maxsize=32)
+def _missed(threshold: float, dof: int) -> tuple[np.ndarray, np.ndarray]:
+    """Biases of unit non-centrality, and the probability that the test misses each."""
+    from scipy.special import chndtr
+
+    bias = np.linspace(0.0, math.sqrt(threshold) + 8.0, 400)
+    return bias, chndtr(threshold, dof, np.maximum(bias**2, 1e-12))
 
 
 @lru_cache(maxsize=4096)
 def _unit_level(vertical: bool, k: int, allowed: float, threshold: float, dof: int) -> float:
-    """Level of unit sigma for the slope STEP^k per unit of sqrt(non-centrality)."""
-    tail = _vertical_tail if vertical else _horizontal_tail
-    return _level(tail, allowed, STEP**k, 1.0, 1.0, threshold, dof)[0]
+    """Level of unit sigma for the slope STEP^k per unit of sqrt(non-centrality); as ``monitors.protection``, 1e-4."""
+    from scipy.special import chndtr, ndtr, ndtri
+
+    bias, missed = _missed(threshold, dof)
+    shift = STEP**k * bias
+    low, high = 0.0, float(shift[-1]) + 4.0 - float(ndtri(min(allowed, 0.5) / 4))
+    while high - low > 1e-4 * high:
+        middle = 0.5 * (low + high)
+        if vertical:
+            tail = ndtr(shift - middle) + ndtr(-shift - middle)
+        else:
+            tail = 1.0 - chndtr(middle**2, 2, np.maximum(shift**2, 1e-12))
+        low, high = (low, middle) if np.max(tail * missed) <= allowed else (middle, high)
+    return high
 
 
 def levels(h_enu: np.ndarray, var: np.ndarray, spec: Protection) -> tuple[float, float]:
@@ -713,8 +733,6 @@ def levels(h_enu: np.ndarray, var: np.ndarray, spec: Protection) -> tuple[float,
 
     With b' = b sqrt(P_ii) the risk of satellite i depends on its slope S_i / sqrt(P_ii) over sigma alone.
     """
-    from scipy.stats import chi2
-
     s, cov, parity = solution(h_enu, var)
     m, q = h_enu.shape
     dof = m - q
@@ -725,7 +743,7 @@ def levels(h_enu: np.ndarray, var: np.ndarray, spec: Protection) -> tuple[float,
     major = float(np.sqrt(np.linalg.eigvalsh(cov[:2, :2])[-1]))
     levels_m = []
     for vertical, sigma, size in ((False, major, np.hypot(s[0], s[1])), (True, up, np.abs(s[2]))):
-        found = float(chi2.isf(part, 1 if vertical else 2) ** 0.5 * sigma)
+        found = math.sqrt(_chi2_limit(1 if vertical else 2, part)) * sigma
         for i in range(m):
             if parity[i, i] * sigma**2 <= 1e-9:
                 return math.inf, math.inf
