@@ -28,7 +28,7 @@ def test_four_definitions_say_nothing_where_there_are_too_few_tests():
 
 
 def test_an_unknown_name_is_one_sentence(tmp_path):
-    with pytest.raises(ValueError, match="allowed: .*ouzeau2008"):
+    with pytest.raises(ValueError, match=r"allowed: .*ouzeau2008"):
         reproduce("ouzeau2009", tmp_path)
 
 
