@@ -258,7 +258,7 @@ class Receiver:
         if not at_once:
             self._held.append((tracker.symbols, tracker.symbol_counts))
         if len(self._held) >= DECODE_EVERY or (at_once and self._held):
-            counts = sum(n for _, n in self._held)
+            counts: Any = sum(n for _, n in self._held)  # array (channels,)
             merged = np.zeros((len(counts), int(counts.max())), tracker.symbols.dtype)
             at = np.zeros(len(counts), np.int64)
             for symbols, n in self._held:
@@ -295,6 +295,7 @@ class Receiver:
 
     def _steer(self, sample: int, epochs: np.ndarray, counts: np.ndarray, out: Outcome) -> None:
         steering = self.steering
+        assert steering is not None
         self._aiding = steering.advance(
             sample, epochs, counts, self.tracker.channels["state"], self.telemetry.ephemerides
         )
@@ -337,7 +338,7 @@ class Receiver:
 
     def _hear(self, rows: list[tuple[int, np.ndarray, np.ndarray]]) -> None:
         """Let the redundant-measurement estimator hear the channels' discriminators."""
-        if self.integrity is None or self.spec.integrity.noise_rmd is None:
+        if self.integrity is None or self.integrity.spec.noise_rmd is None:
             return
         channels = self.tracker.channels
         for c, epochs, _ in rows:
@@ -351,7 +352,11 @@ class Receiver:
         channels = self.tracker.channels
         for monitor in self.monitors:
             for c, epochs, corr in out.epochs:
-                signal, prn, k = channels["signal"][c].decode(), int(channels["prn"][c]), self.tracker.window(c)
+                signal, prn, k = (
+                    channels["signal"][c].decode(),
+                    int(channels["prn"][c]),
+                    self.tracker.window(c),
+                )
                 taps = self._nominal_taps(signal), self.tracker.taps_chips(c)[:k]
                 rows = monitor(signal, prn, epochs, corr[:, :k], taps, self.waveform(signal))
                 if len(rows):
@@ -359,6 +364,7 @@ class Receiver:
 
     def _nominal_taps(self, signal: str) -> np.ndarray:
         window = (self.spec.tracking.l1ca if signal == "L1CA" else self.spec.tracking.e1).taps
+        assert window is not None
         return window.spacing_chips * (np.arange(window.count) - window.count // 2)
 
     def waveform(self, signal: str) -> str:
@@ -390,7 +396,6 @@ class Receiver:
                 row |= self._pilot(c, prn)
             rows.append(row)
         return rows
-
 
     def _pilot(self, c: int | None, prn: int) -> dict[str, Any]:
         """What Galileo's pilot showed: CS25_1 aligned, and I/NAV sync patterns on E1-B by sign."""
