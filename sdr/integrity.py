@@ -93,6 +93,8 @@ class Limits(Protection):
     hal_m: float = Field(40.0, gt=0)
     """Horizontal alert limit."""
     val_m: float = Field(50.0, gt=0)
+    every_s: float = Field(1.0, ge=0)
+    """Levels are computed at the first position this long after the last."""
     """Vertical alert limit."""
 
 
@@ -226,8 +228,6 @@ class IntegrityLive:
         self.spec, self.respond, self.fs_hz = spec, respond, fs_hz
         self.alarms = {n: _Alarms(spec.gap_s) for n in MONITORS if getattr(spec, n) is not None}
         self.remedy: Remedy | None = None
-        self.seconds = 0.0
-        """Processor time spent here."""
         self._filter: IntegrityRun | None = None
         self._view: Any = None  # _FilterView: what the monitors of the filter read of an Eskf
         self._bank: Any = None  # run of the bias bank
@@ -242,6 +242,7 @@ class IntegrityLive:
         self._only: tuple[str, float] = ("", 0.0)
         self._past: list[tuple[list[str], np.ndarray, np.ndarray]] = []
         self._new_bias: dict[str, float] = {}
+        self._next_level_s = 0.0
 
     def watch(self, navigator: Navigator) -> None:
         """Have the navigator's filter logged where a monitor needs it."""
@@ -373,9 +374,9 @@ class IntegrityLive:
         out["bias_bank"] = _row(
             name, sample, t_s, value, self.spec.bias_bank.declare, float(report.bias_m[best])
         )
-        self._past.append((list(snap.names), *_scores(raw, h, var, ~gone)))
-        del self._past[:-MEMORY]
         if self.respond.bias:
+            self._past.append((list(snap.names), *_scores(raw, h, var, ~gone)))
+            del self._past[:-MEMORY]
             found = self._bank.correction_m(report)
             before, self._shift = self._shift, {n: float(b) for n, b in zip(self._bank_names, found) if b}
             self._new_bias = {n: b for n, b in self._shift.items() if not before}
@@ -402,8 +403,9 @@ class IntegrityLive:
         return -c
 
     def _protect(self, snap, h, var, sample, t_s, out) -> None:
-        if self.spec.protection is None:
+        if self.spec.protection is None or t_s < self._next_level_s:
             return
+        self._next_level_s = t_s + self.spec.protection.every_s - 1e-6
         use = snap.use
         lat, lon, _ = geodetic_from_ecef(snap.pos_ecef_m)
         enu = -snap.los[use] @ rotation_enu_to_ecef(lat, lon)
@@ -538,7 +540,7 @@ class IntegrityLive:
             scheme = SCHEMES[self.spec.noise_rmd.scheme]
             mean = window_variance(kept, window, scheme, self.spec.noise_rmd.decay)
             t_s = float(locked["n_samples"][-1]) / self.fs_hz
-            gain = code_gain(name[0], loops.early_late_space_chips, float(np.median(locked["cn0_dbhz"])), t_s)
+            gain = code_gain(name[0], loops.early_late_space_chips, round(float(locked["cn0_dbhz"][-1])), t_s)
             share = loop_share(0.0 if steered else loops.dll_bw_hz, t_s, gain)
             self._rmd[name] = mean * share + self.spec.noise_rmd.r0_m2
 
@@ -636,6 +638,7 @@ def loop_share(dll_bw_hz: float, integration_s: float, gain: float = 1.0) -> flo
     return x / ((gain * gain * a) ** 2 * x + (1.0 + gain * a) ** 2 + 1.0)
 
 
+@lru_cache(maxsize=512)
 def code_gain(signal: str, spacing_chips: float, cn0_dbhz: float, integration_s: float) -> float:
     """Gain of the normalised code discriminator in noise (``nav.ultratight.discriminator_table``)."""
     row = np.empty(4)
