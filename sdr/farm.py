@@ -275,7 +275,8 @@ class Results:
         )
         axes = json.dumps(self.campaign.settings[:2000], default=str)
         out.append("campaign/points", points, **self.head(), axes=axes)
-        out.append("campaign/thresholds", self.thresholds)
+        # In the order of the groups, not in that of their completion.
+        out.append("campaign/thresholds", np.sort(self.thresholds, order=["group", "monitor"]))
         rows = [r for c in self.counts for r in c.rows]
         out.append("campaign/trials", np.concatenate(rows) if rows else np.zeros(0, TRIAL))
         rates = self.rows()
@@ -442,7 +443,10 @@ class _Cluster:
     def submit(self, function: Callable, *args: Any) -> futures.Future:
         """A future of ``function(*args)``."""
         self.check()
-        return self._executor.submit(function, *args)
+        try:
+            return self._executor.submit(function, *args)
+        except (OSError, RuntimeError, ValueError):  # what a client says that has just lost its scheduler
+            raise OSError(self._lost()) from None
 
     def revive(self) -> None:
         """A chunk was lost with its workers."""
@@ -525,7 +529,7 @@ def _result(crew: Any, f: futures.Future, out: dict) -> Iterator[tuple[Any, Any]
             out[crew.submit(again[1], *again[2])] = again
         return
     except Exception as err:
-        if type(err).__module__.startswith("distributed"):
+        if type(err).__module__.startswith("distributed") or isinstance(err, ConnectionError):
             crew.revive()
         raise
     del out[f]
