@@ -33,6 +33,8 @@ DECODE_EVERY = 10
 """Slabs whose symbols are decoded together while the channels are steered."""
 TAKE_EVERY = 25
 """New channels are put under command every so many navigation epochs."""
+WIDEST = 4.0
+"""The Doppler range is doubled, up to so many times the one asked for, while too few satellites are found."""
 RETRY_S = 1.0
 """A satellite that was lost is looked for again this soon."""
 
@@ -78,7 +80,7 @@ class Receiver:
         self.mitigation = spec.mitigation.start(source) if spec.mitigation else None
         self.source = self.mitigation or source
         self.fs_hz = float(source.fs_hz)
-        self.tracker = spec.tracking.start(source.fs_hz, source.if_hz)
+        self.tracker = spec.tracking.start(source.fs_hz, source.if_hz, spec.codes_path)
         self.telemetry = Telemetry(self.tracker)
         self.navigator = spec.navigation.start(source.fs_hz)
         self.steering = self._start_steering(sensors)
@@ -89,6 +91,7 @@ class Receiver:
             self.integrity.watch(self.navigator)
         self.channel_of: dict[tuple[str, int], int] = {}
         self.searched: dict[str, list[int]] = {}
+        self._search_spec = spec.acquisition
         self.position = 0
         self._week: int | None = None
         self._held: list[tuple[np.ndarray, np.ndarray]] = []
@@ -195,14 +198,20 @@ class Receiver:
         return lost + ([missing[self._turn % len(missing)]] if missing else [])
 
     def _acquire(self, first: int, samples: np.ndarray, due: list[tuple[str, int]]) -> np.ndarray:
-        spec = self.spec.acquisition
+        spec = self._search_spec
+        if len(self.channel_of) < ENOUGH and self._full_searches > 1:
+            # Too few: the recorder's oscillator may be further off than was thought.
+            wider_hz = min(2 * spec.doppler_range_hz, WIDEST * self.spec.acquisition.doppler_range_hz)
+            spec = self._search_spec = spec.model_copy(update={"doppler_range_hz": wider_hz})
         found = []
         for signal in dict.fromkeys(s for s, _ in due):
             prns = [p for s, p in due if s == signal]
             if samples.shape[1] < 2 * SIGNALS[signal].code_period_s * self.fs_hz or not samples.any():
                 continue
             self.searched[signal] = sorted({*self.searched.get(signal, ()), *prns})
-            rows = acquire(samples, first, self.fs_hz, self.source.if_hz, signal, prns, spec)
+            rows = acquire(
+                samples, first, self.fs_hz, self.source.if_hz, signal, prns, spec, self.spec.codes_path
+            )
             for row in rows[rows["acquired"]]:
                 self._decode(at_once=True)  # before a channel changes hands
                 c = self.tracker.add(row)
@@ -213,7 +222,7 @@ class Receiver:
 
     def searched_text(self) -> str:
         """What has been searched, for people."""
-        spec = self.spec.acquisition
+        spec = self._search_spec
         span = f"within {spec.doppler_center_hz:+.0f} ± {spec.doppler_range_hz:.0f} Hz"
         return "; ".join(f"{s} PRN {_ranges(p)} {span}" for s, p in self.searched.items())
 
