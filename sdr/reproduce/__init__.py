@@ -29,6 +29,7 @@ EXPERIMENTS = {
     "abdelhafez-als": "sdr.reproduce.als",
     "abdelhafez-bias": "sdr.reproduce.bias",
     "vanek1999": "sdr.reproduce.vanek",
+    "karaim2020": "sdr.reproduce.karaim",
 }
 """Command-line name -> module with ``run``; imported only when asked for."""
 VERDICTS = ("reproduced", "not reproduced", "not stated")
