@@ -93,6 +93,7 @@ class Limits(Protection):
     hal_m: float = Field(40.0, gt=0)
     """Horizontal alert limit."""
     val_m: float = Field(50.0, gt=0)
+    """Vertical alert limit."""
     every_s: float = Field(1.0, ge=0)
     """Levels are computed at the first position this long after the last."""
     """Vertical alert limit."""
