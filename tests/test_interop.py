@@ -12,7 +12,7 @@ LEAP_S = 18  # GPS - UTC since 2017
 
 
 def _judge(tmp_path, name, overrides, n_gps, n_galileo):
-    overrides = [*overrides, "duration_s=62"]
+    overrides = [*overrides, "duration_s=75"]
     made = jobs.simulate(name, tmp_path / "sky", overrides=overrides, threads=2, quiet=True)
     data = next(f for f in made["files"] if f.endswith(".sigmf-data"))
     fixes = positions(data, tmp_path, n_gps, n_galileo)
