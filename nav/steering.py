@@ -14,6 +14,7 @@ import numpy as np
 from nav import pvt
 from nav import ultratight_kernels as kernels
 from nav.imu import ImuSpec, OdometerSpec
+from nav.measurements import WEEK_MS
 from nav.records import SATELLITE, SOLUTION, STEERING
 from nav.riss import speed_at
 from nav.ultratight import (
@@ -29,7 +30,7 @@ from nav.ultratight import (
     nominal_of,
     start_covariance,
 )
-from signals.constants import C_MPS, SECONDS_PER_WEEK
+from signals.constants import C_MPS, SECONDS_PER_WEEK, WAVELENGTH_M
 from signals.orbits import orbit_coefficients
 from signals.records import EPHEMERIS
 from tracking.lock import STATE_LOCKED
@@ -235,6 +236,28 @@ class Steering:
             return False
         self.inflate[self.name.index((signal, prn))] = factor
         return True
+
+    def measure(self, rows, channels):
+        """Turn the NCOs' TRANSMIT ``rows`` of steered ``channels`` into measurements: NCO plus discriminator, in place.
+
+        The code phase and the Doppler move by what the discriminators saw, smoothed in ``kernels.OBSERVED_HZ``; the carrier's
+        phase is the NCO's own and says nothing, which its lock time of 0 tells. Others are left alone.
+        """
+        at = {int(self.slot[i]): i for i in np.flatnonzero(self.active)}
+        for row, c in zip(rows, channels):
+            if int(c) not in at:
+                continue
+            kept = self.filter.power[at[int(c)]]
+            if kept[kernels.WEIGHT] == 0.0:
+                continue  # taken over just now
+            tow_s = row["tow_tx_frac_s"] - kept[kernels.RANGE_OFF_M] / C_MPS
+            whole = math.floor(tow_s * 1e3)
+            if row["tow_tx_ms"] >= 0:
+                row["tow_tx_ms"] = (row["tow_tx_ms"] + whole) % WEEK_MS
+            row["tow_tx_frac_s"] = tow_s - whole * 1e-3
+            row["doppler_hz"] -= kept[kernels.RATE_OFF_MPS] / WAVELENGTH_M
+            row["cn0_dbhz"] = min(row["cn0_dbhz"], 10.0 * math.log10(max(kept[kernels.CN0_HZ], 1.0)))
+            row["lock_s"], row["cycle_slip"] = 0.0, True
 
     def refresh(self, ephemerides):
         """Newest ephemerides, atmosphere and elevation of all channels."""

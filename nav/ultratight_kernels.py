@@ -51,10 +51,15 @@ ECEF17, KINEMATIC = 2, 3
 N_X, ACC, ISB = 32, 27, 30
 """Length of the nominal state; ECEF acceleration (3) of the last prediction; inter-system bias, m."""
 
-N_CN0 = 7
-"""Columns of a channel's power monitor: prompt power fast and slow, noise power fast, time watched, mean of squared
-range innovations, C/N0 (Hz), signal power remembered from when it was strong."""
-P_FAST, P_SLOW, N_FAST, WEIGHT, NIS_MEAN, CN0_HZ, SIGNAL = range(7)
+N_CN0 = 11
+"""Columns of what is kept of a channel: prompt power fast and slow, noise power fast, time watched, mean of squared range
+innovations, C/N0 (Hz), signal power remembered from when it was strong; smoothed range and rate, measured minus predicted
+(m, m/s), and the same measured minus NCO."""
+P_FAST, P_SLOW, N_FAST, WEIGHT, NIS_MEAN, CN0_HZ, SIGNAL, RANGE_M, RATE_MPS, RANGE_OFF_M, RATE_OFF_MPS = (
+    range(11)
+)
+OBSERVED_HZ = 1.0
+"""Bandwidth in which ranges and rates are smoothed for observations: that of a scalar receiver's code loop."""
 STRONG = 10.0
 """C/N0 T above which the signal's own power is learnt."""
 
@@ -508,6 +513,27 @@ def weigh(code_m, rate_mps, off_m, off_mps, span_s, seen, cn0, inflate, tables, 
 
 
 @njit(cache=True, nogil=True)
+def observe(seen, span_s, z, gain_code, gain_rate, off_m, off_mps, rho, rate, before_m, before_mps, power):
+    """What each channel measured in itself, for observations: y <- y + k (z / g - y), z / g = measured - predicted.
+
+    k = 4 B T / (1 + 2 B T), a first-order loop's; afterwards the prediction is the corrected one, so that y + rho is the
+    measured range, in which the filter's correction does not show. ``before_*``: the prediction that z refers to.
+    """
+    count = seen.size
+    for c in range(count):
+        if seen[c] == 0:
+            continue
+        row = power[c]
+        bt = OBSERVED_HZ * seen[c] * span_s[c]
+        k = 4.0 * bt / (1.0 + 2.0 * bt)
+        row[RANGE_M] += k * (z[c] / gain_code[c] - row[RANGE_M])
+        row[RATE_MPS] += k * (z[count + c] / gain_rate[c] - row[RATE_MPS])
+        row[RANGE_OFF_M], row[RATE_OFF_MPS] = row[RANGE_M] - off_m[c], row[RATE_MPS] - off_mps[c]
+        row[RANGE_M] -= rho[c] - before_m[c]
+        row[RATE_MPS] -= rate[c] - before_mps[c]
+
+
+@njit(cache=True, nogil=True)
 def steer(active, slot, period_s, sample, rx_ms, rx_frac_s, rho, rate, accel, lead_s, commands):
     """NCO commands from ``sample`` on: code phase, Doppler and its rate.
 
@@ -550,22 +576,8 @@ def navigation_epoch(model, x, p, sensors, dt_s, filter_s, rates, q_diag, limit,
         orbit, toe_toc_tgd, active, tow_whole, tow_frac, rho, sat_pos, sat_vel, sat_acc, clock, clock_rate
     )
     pseudoranges(
-        model,
-        x,
-        active,
-        second,
-        sat_pos,
-        sat_vel,
-        sat_acc,
-        clock,
-        clock_rate,
-        delay,
-        delay_rate,
-        rho,
-        rate,
-        accel,
-        los,
-    )
+        model, x, active, second, sat_pos, sat_vel, sat_acc, clock, clock_rate, delay, delay_rate, rho, rate, accel, los
+    )  # fmt: skip
     read_epochs(
         epochs, counts, slot, active, period_s, sample, fs_hz, rx_frac_s, rx_ms, rho, rate, accel, tables, which, power,
         fast_s, slow_s, code_m, rate_mps, off_m, off_mps, span_s, seen,
@@ -581,23 +593,11 @@ def navigation_epoch(model, x, p, sensors, dt_s, filter_s, rates, q_diag, limit,
     )  # fmt: skip
     rows(model, x, n, los, second, gain_code, gain_rate, tp, tv, h)
     nis, n_rows = filter_update(model, x, p, h, z, var, used, power, limit, k, s, p_prior, dx)
+    before_m, before_mps = rho.copy(), rate.copy()
     pseudoranges(
-        model,
-        x,
-        active,
-        second,
-        sat_pos,
-        sat_vel,
-        sat_acc,
-        clock,
-        clock_rate,
-        delay,
-        delay_rate,
-        rho,
-        rate,
-        accel,
-        los,
-    )
+        model, x, active, second, sat_pos, sat_vel, sat_acc, clock, clock_rate, delay, delay_rate, rho, rate, accel, los
+    )  # fmt: skip
+    observe(seen, span_s, z, gain_code, gain_rate, off_m, off_mps, rho, rate, before_m, before_mps, power)
     steer(active, slot, period_s, sample, rx_ms, rx_frac_s, rho, rate, accel, LEAD_S, commands)
     tracked = 0
     for c in range(count):

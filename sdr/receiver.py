@@ -132,9 +132,9 @@ class Receiver:
         rows = [(c, epochs[c, :n], corr[c, :n]) for c, n in enumerate(counts) if n]
         out = Outcome(n0, n_end, found, rows)
         self._hear(rows)
-        if self.steering is not None and self.steering.filter is not None:
+        if self._steered:
             self._steer(n_end, epochs, counts, out)
-        elif navigate:
+        if navigate:
             self._navigate(n_end, out)
             self._hand_over(n_end, out)
         self._watch(out)
@@ -239,28 +239,37 @@ class Receiver:
             out.observations.append(seen)
             if solution is not None:
                 out.views.append(self.navigator.view())
-        if solution is not None:
+        if solution is not None and not self._steered:
             out.solutions.append(np.atleast_1d(np.asarray(solution, SOLUTION)))
         if self.integrity is not None:
             # What it asks for holds from the next epoch on: the hand-over to navigation, one epoch later.
             out.integrity.append(self.integrity(self.navigator, sample))
 
     def transmit(self, sample: int) -> np.ndarray:
-        """TRANSMIT rows of the locked channels at one receiver sample."""
+        """TRANSMIT rows of the locked channels at one receiver sample; steered ones need no phase lock."""
         replica = self.tracker.snapshot(sample)
-        locked = np.flatnonzero((replica["state"] == STATE_LOCKED) & replica["phase_locked"])
+        followed = replica["phase_locked"] | (self._steered & (self.tracker.channels["steered"] != 0))
+        locked = np.flatnonzero((replica["state"] == STATE_LOCKED) & followed)
         r = replica[locked]
         reference = [self.telemetry.reference(int(c)) for c in locked]
         slips = self.telemetry.slipped(locked, r["slips"])
-        return transmit_rows(
+        rows = transmit_rows(
             sample, r["signal"], r["prn"], r["code_period"], [p for p, _ in reference], [t for _, t in reference],
             r["code_phase_chips"], r["doppler_hz"], r["carrier_phase_cycles"], r["cn0_dbhz"], r["lock_s"], slips,
         )  # fmt: skip
+        if self._steered:
+            self.steering.measure(rows, locked)
+        return rows
+
+    @property
+    def _steered(self) -> bool:
+        """Whether a filter steers the channels now."""
+        return self.steering is not None and self.steering.filter is not None
 
     def _decode(self, at_once: bool = False) -> None:
         """Feed the decoders; while steered, whose slabs are short, a few slabs at a time."""
         tracker = self.tracker
-        if not self._held and (self.steering is None or self.steering.filter is None):
+        if not self._held and not self._steered:
             if not at_once:
                 self.telemetry.update()
             return
@@ -318,7 +327,7 @@ class Receiver:
 
     def _hand_over(self, sample: int, out: Outcome) -> None:
         """Let the filter take the channels over from a scalar fix."""
-        if self.steering is None or not out.solutions:
+        if self.steering is None or self._steered or not out.solutions:
             return
         row = out.solutions[-1][0]
         self._week = int(row["week"])

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from nav import ultratight_kernels as kernels
 from nav.ultratight import COASTING, STEERED
 from sdr import scenario
 from sdr.receiver import Receiver
@@ -83,3 +84,48 @@ def test_scalar_mode_gives_the_bits_of_no_steering_at_all():
             ]
         )
     assert results[0] == results[1]
+
+
+def test_steered_channels_give_observations_at_the_scalar_rate_and_noise(outage):
+    source, outcomes = outage
+    obs = np.concatenate([r for o in outcomes for r in o.observations])
+    t = obs["sample_index"] / source.fs_hz
+    row = {s.prn: i for i, s in enumerate(source.sky.satellites)}
+    error = []
+    for sample in np.unique(obs["sample_index"][(t > 24.5) & (t <= 25.9)]):
+        o = obs[obs["sample_index"] == sample]
+        true = source.sky.propagate(np.array([sample / source.fs_hz]))
+        e = o["pseudorange_m"] - 299_792_458.0 * true.delay_s[[row[int(p)] for p in o["prn"]], 0]
+        error.append(e - e.mean())  # the receiver's clock
+    assert len(error) == 7  # 5 Hz
+    # 44 dB-Hz, E-L 0.5 chip, loop of 1 Hz: sigma^2 = B d / (2 C/N0) chips^2, 0.92 m; 7 correlated epochs of 8 satellites.
+    sigma_m = 293.05 * np.sqrt(1.0 * 0.5 / (2 * 10**4.4))
+    assert 0.6 * sigma_m < np.std(np.concatenate(error)) < 1.5 * sigma_m
+    # No phase is tracked, which the lock time says.
+    assert not obs["lock_s"][(t > 24.5) & (t < 26)].any()
+    dark = (t > OUTAGE_S[0] + 2) & (t < OUTAGE_S[1])
+    assert dark.sum() < 8
+
+
+def test_a_fault_shows_in_the_ranges_of_a_steered_channel():
+    # The filter believes nothing of it and leaves its NCO on the prediction; the discriminator alone carries the 12 m, and
+    # what the filter corrects meanwhile (0.3 m an epoch, in both channels) must not be counted twice.
+    T, n = 0.02, 100
+    power, zeros = np.zeros((2, kernels.N_CN0)), np.zeros(2)
+    rho, rate, truth = (
+        np.array([2.2e7, 2.3e7]),
+        np.zeros(2),
+        np.array([2.2e7 + 12.0 + 0.3 * n, 2.3e7 + 0.3 * n]),
+    )
+    gain = np.array([0.5, 1.0])
+    for _ in range(n):
+        z = np.concatenate([gain * (truth - rho), np.array([0.25, 0.0])])
+        before, rho = rho, rho + 0.3
+        kernels.observe(
+            np.ones(2, np.int64), np.full(2, T), z, gain, gain, zeros, zeros, rho, rate, before, rate, power
+        )
+    # It began at zero, 42 m off, and forgets that by 1 - 4 B T / (1 + 2 B T) an epoch; a moving reference leaves no lag.
+    left = 42.0 * (1.0 - 0.08 / 1.04) ** n
+    assert rho + power[:, kernels.RANGE_M] == pytest.approx(truth, abs=1.01 * left)
+    assert power[:, kernels.RATE_MPS] == pytest.approx([0.5, 0.0], abs=1e-3)
+    assert power[:, kernels.RANGE_OFF_M] == pytest.approx(truth - rho + 0.3, abs=1.1 * left)
