@@ -410,10 +410,10 @@ class AlsRun:
         self.unavailable: str | None = None
         self._seen = 0
 
-    def __call__(self, filt: Eskf, respond: bool = True) -> AlsResult | None:
-        """Look at the filter's log; with ``respond=False`` the filter is only read, never touched."""
+    def __call__(self, filt: Eskf, respond: bool = True, epochs: int = 1) -> AlsResult | None:
+        """Look at the filter's log, ``epochs`` longer than at the last call; without ``respond`` it is only read."""
         need = self.spec.settle_epochs + self.spec.window_epochs
-        self._seen += 1
+        self._seen += epochs
         if self._seen < need:
             return None
         self._seen = 0

@@ -38,32 +38,96 @@ def parity_rows(h: np.ndarray) -> np.ndarray:
     return vt[: hg.shape[0] - hg.shape[1]]
 
 
+@njit(cache=True, nogil=True)
+def whitened_parity(h, var, w):
+    """W = R^-1 - R^-1 H (H' R^-1 H)^-1 H' R^-1 into ``w`` (m, m), R = diag(var); returns the rank of H.
+
+    Orthonormal basis Q of R^-1/2 H by Gram-Schmidt, each column twice (Bjorck 1967); W = R^-1/2 (I - Q Q') R^-1/2.
+    """
+    m, n = h.shape
+    q = np.zeros((n, m))
+    root = np.empty(m)
+    for a in range(m):
+        root[a] = 1.0 / math.sqrt(var[a])
+    rank = 0
+    for j in range(n):
+        size = 0.0
+        for a in range(m):
+            q[rank, a] = h[a, j] * root[a]
+            size += q[rank, a] * q[rank, a]
+        for _ in range(2):
+            for i in range(rank):
+                dot = 0.0
+                for a in range(m):
+                    dot += q[i, a] * q[rank, a]
+                for a in range(m):
+                    q[rank, a] -= dot * q[i, a]
+        left = 0.0
+        for a in range(m):
+            left += q[rank, a] * q[rank, a]
+        if left <= SINGULAR * SINGULAR * size:
+            continue
+        left = 1.0 / math.sqrt(left)
+        for a in range(m):
+            q[rank, a] *= left
+        rank += 1
+        if rank == m:
+            break
+    for a in range(m):
+        for b in range(m):
+            acc = 1.0 if a == b else 0.0
+            for i in range(rank):
+                acc -= q[i, a] * q[i, b]
+            w[a, b] = acc * root[a] * root[b]
+    return rank
+
+
 def geometry(h: np.ndarray) -> np.ndarray:
     """The non-zero columns of H, checked: at least two more rows than columns, and full rank."""
-    h = np.asarray(h, dtype=np.float64)
-    if h.ndim != 2 or not np.all(np.isfinite(h)):
-        raise ValueError("H must be a finite matrix of one row per satellite.")
+    h = _finite(h)
     hg = h[:, np.abs(h).max(axis=0) > 0]
-    m = h.shape[0]
     # The range part of any navigation filter observes 3 coordinates and one clock per constellation.
     value = np.linalg.svd(hg, compute_uv=False)
     rank = int((value > SINGULAR * value[0]).sum()) if value.size else 0
-    if m < rank + 2:
-        raise ValueError(
-            f"The bias bank needs {rank + 2} satellites to tell which one is biased, {m} are in use."
-        )
-    if rank < min(hg.shape[1], 4):
-        raise ValueError("The satellite geometry is singular: H has no full column rank.")
+    _check(rank, *hg.shape)
     if rank < hg.shape[1]:
         u, _, _ = np.linalg.svd(hg, full_matrices=False)
         hg = u[:, :rank]
     return hg
 
 
+def _finite(h: np.ndarray) -> np.ndarray:
+    h = np.ascontiguousarray(h, dtype=np.float64)
+    if h.ndim != 2 or not np.isfinite(h).all():
+        raise ValueError("H must be a finite matrix of one row per satellite.")
+    return h
+
+
+def _check(rank: int, m: int, columns: int) -> None:
+    if m < rank + 2:
+        raise ValueError(
+            f"The bias bank needs {rank + 2} satellites to tell which one is biased, {m} are in use."
+        )
+    if rank < min(columns, 4):
+        raise ValueError("The satellite geometry is singular: H has no full column rank.")
+
+
+def parity_weight(h: np.ndarray, var: np.ndarray) -> tuple[np.ndarray, int]:
+    """(W (m, m) of the module's docstring, its degrees of freedom) for R = diag(``var``), m^2."""
+    h, var = _finite(h), np.ascontiguousarray(var, dtype=np.float64)
+    if not (var > 0).all():
+        raise ValueError("The bias bank needs measurement variances above zero.")
+    w = np.empty((var.size, var.size))
+    rank = whitened_parity(h, var, w)
+    _check(rank, var.size, int(h.any(axis=0).sum()))
+    return w, var.size - rank
+
+
 def weight_matrix(h: np.ndarray, r_cov: np.ndarray) -> np.ndarray:
     """W (m, m) of the module's docstring; ``r_cov`` (m,) variances or (m, m) covariance, m^2."""
-    hg = geometry(h)
-    cov = np.diag(r_cov) if np.ndim(r_cov) == 1 else np.asarray(r_cov)
+    if np.ndim(r_cov) == 1:
+        return parity_weight(h, r_cov)[0]
+    hg, cov = geometry(h), np.asarray(r_cov)
     if not np.all(np.diag(cov) > 0):
         raise ValueError("The bias bank needs measurement variances above zero.")
     ri = np.linalg.inv(cov)
@@ -251,9 +315,12 @@ class BiasBankRun:
         m = r.size
         used = np.ones(m, dtype=np.bool_) if used is None else np.asarray(used, dtype=np.bool_)
         u = np.flatnonzero(used)
-        cov = np.asarray(r_cov)[u] if np.ndim(r_cov) == 1 else np.asarray(r_cov)[np.ix_(u, u)]
         try:
-            part = weight_matrix(h[u], cov)
+            if np.ndim(r_cov) == 1:
+                part, dof = parity_weight(h[u], np.asarray(r_cov)[u])
+            else:
+                part = weight_matrix(h[u], np.asarray(r_cov)[np.ix_(u, u)])
+                dof = u.size - np.linalg.matrix_rank(h[u], tol=SINGULAR)
         except (ValueError, np.linalg.LinAlgError) as error:
             self.unavailable = str(error)
             return None
@@ -264,7 +331,7 @@ class BiasBankRun:
         null = update_log(self.log_p, w, y, self.row, self.bias_m, math.log(self.spec.floor))
         slot = self._count % self.spec.fit_epochs
         self._chi2[slot] = null - 2 * self.bias_m * (w @ y)[self.row] + self.bias_m**2 * np.diag(w)[self.row]
-        self._dof[slot] = u.size - np.linalg.matrix_rank(h[u], tol=SINGULAR)
+        self._dof[slot] = dof
         self._count += 1
         return self._report()
 

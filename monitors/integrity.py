@@ -12,8 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from monitors.als import Als, AlsResult
 from monitors.bias_bank import BiasBank, BiasReport
-from monitors.parallel_filters import BankReport, ParallelFilters
-from nav import eskf_kernels as kernels
+from monitors.parallel_filters import BankReport, PacedBank, ParallelFilters
 from nav.eskf import Eskf
 
 LEAST_SHARE = 1e-4
@@ -72,16 +71,15 @@ class IntegrityRun:
         m = filt.n_rows
         if rows.size == 0 or rows.min() < 0 or rows.max() >= m or np.unique(rows).size != rows.size:
             raise ValueError(f"range_rows must be different measurement rows between 0 and {m - 1}.")
-        n = filt.p.shape[0]
         self.spec, self.rows = spec, rows
         self.aids = np.zeros(0, dtype=np.int64) if aid_rows is None else np.asarray(aid_rows)
         self._als = None if spec.als is None else spec.als.start(rows)
         self._bias = None if spec.bias_bank is None else spec.bias_bank.start(rows.size)
-        self._bank = None if spec.parallel_filters is None else spec.parallel_filters.start(rows.size, filt.p)
+        self._bank = None
+        if spec.parallel_filters is not None:
+            self._bank = PacedBank(spec.parallel_filters, rows.size, filt.p, spec.bank_every)
         self._var, self._shift = np.full(m, np.nan), np.zeros(m)
         self._exclude = np.zeros(m, dtype=np.bool_)
-        self._phi, self._qd, self._moved = np.eye(n), np.zeros((n, n)), np.zeros(n)
-        self._epoch = 0
 
     def __call__(self, filt: Eskf, dx: np.ndarray, z=None, h=None, seen=None) -> Remedy:
         """One epoch.
@@ -128,32 +126,22 @@ class IntegrityRun:
         return report
 
     def _parallel(self, filt, log, raw, h, seen, dx, lacks) -> tuple[BankReport | None, np.ndarray | None]:
-        """Parallel filters about the trajectory that was not corrected since their last epoch: z = r + H moved."""
-        if self._bank is None or self.spec.parallel_filters is None:
-            return None, None
-        kernels.chain(self._phi, self._qd, log.phi[0], log.qd[0])
-        self._moved = log.phi[0] @ self._moved
-        self._epoch += 1
-        if self._epoch % self.spec.bank_every:
-            self._moved += dx
+        """Parallel filters; what they declare is excluded, and the filter reset, where that is asked for."""
+        if self._bank is None:
             return None, None
         rows, aids = self.rows, self.aids[log.used[0][self.aids]]
-        z = raw + h @ self._moved
-        var = log.var[0] + self.spec.parallel_filters.r0_m2
-        extra = (h[aids], z[aids], log.var[0][aids]) if aids.size else (None, None, None)
-        safe = np.where(seen, var, 1.0)[rows]
-        report = self._bank(self._phi, self._qd, h[rows], z[rows], safe, seen[rows], *extra)
-        self._moved += dx
-        self._bank.shift(self._moved)
-        self._moved = np.zeros_like(self._moved)
-        self._phi, self._qd = np.eye(dx.size), np.zeros((dx.size, dx.size))
-        if self._bank.unavailable:
-            lacks["parallel_filters"] = self._bank.unavailable
+        others = (h[aids], raw[aids], log.var[0][aids]) if aids.size else None
+        report = self._bank(
+            log.phi[0], log.qd[0], h[rows], raw[rows], log.var[0][rows], seen[rows], dx, others
+        )
+        if report is None:
+            return None, None
+        if self._bank.bank.unavailable:
+            lacks["parallel_filters"] = self._bank.bank.unavailable
         if self.spec.respond.exclude:
-            self._exclude[rows] = self._bank.excluded
+            self._exclude[rows] = self._bank.bank.excluded
         if not (report.reset and self.spec.respond.reset):
             return report, None
-        correction = self._bank.x[0].copy()
-        self._bank.shift(correction)
+        correction = self._bank.takeover()
         filt.reset(report.p)
         return report, correction

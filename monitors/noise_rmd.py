@@ -7,11 +7,17 @@ for 4 ms codes): each half has 2 R, so R = E[d^2] / 4, as long as the squaring l
 """
 
 import math
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
 from numba import njit
 from pydantic import BaseModel, ConfigDict, Field
+
+from nav.ultratight import discriminator_table
+from nav.ultratight_kernels import look_up
+from signals.constants import METRES_PER_CHIP
+from tracking.lock import STATE_LOCKED
 
 PRINTED, UNBIASED, AGE_WEIGHTED = 0, 1, 2
 SCHEMES = {"printed": PRINTED, "unbiased": UNBIASED, "age_weighted": AGE_WEIGHTED}
@@ -121,3 +127,64 @@ class NoiseRmdRun:
                 args = scheme, s.decay, s.divisor, s.r0_m2, short, s.adaptive_ratio
                 out[i] = tuned_variance(self._ring[i], self._count[i], *args)
         return out
+
+
+class DiscriminatorNoise:
+    """Range variance of channels from differences of their successive code discriminators, without a second channel.
+
+    ``hear`` every channel's new integrations; ``variance_m2`` then holds those whose window of differences is full.
+    """
+
+    def __init__(self, spec: NoiseRmd, fs_hz: float):
+        self.spec, self.fs_hz = spec, fs_hz
+        self.variance_m2: dict[str, float] = {}
+        self._differences: dict[str, np.ndarray] = {}
+        self._last: dict[str, tuple[int, float]] = {}
+
+    def hear(self, name: str, epochs: np.ndarray, loops, steered: bool = False) -> None:
+        """``epochs``: EPOCH rows of satellite ``name``; ``loops``: its tracking Spec; ``steered``: from outside."""
+        locked = epochs[epochs["state"] == STATE_LOCKED]
+        if not len(locked):
+            self._last.pop(name, None)
+            return
+        error = METRES_PER_CHIP * locked["code_error_chips"].astype(float)
+        begin = locked["sample_index"].astype(np.int64)
+        end = begin + locked["n_samples"]
+        before, last = self._last.get(name, (-1, 0.0))
+        joined = np.concatenate([[before], end[:-1]]) == begin
+        d = np.diff(np.concatenate([[last], error]))[joined]
+        self._last[name] = int(end[-1]), float(error[-1])
+        window = self.spec.window
+        kept = np.concatenate([self._differences.get(name, np.zeros(0)), d])[-window:]
+        self._differences[name] = kept
+        if len(kept) < window:
+            return
+        mean = window_variance(kept, window, SCHEMES[self.spec.scheme], self.spec.decay)
+        t_s = float(locked["n_samples"][-1]) / self.fs_hz
+        gain = code_gain(name[0], loops.early_late_space_chips, round(float(locked["cn0_dbhz"][-1])), t_s)
+        share = loop_share(0.0 if steered else loops.dll_bw_hz, t_s, gain)
+        self.variance_m2[name] = mean * share + self.spec.r0_m2
+
+
+def loop_share(dll_bw_hz: float, integration_s: float, gain: float = 1.0) -> float:
+    """Variance of the replica's code phase over E[(e_{k+1} - e_k)^2] of successive discriminators e.
+
+    First-order loop x' = x - a e, e = g x + n, a = 4 B T / (1 + 2 B T), g the discriminator's gain in noise: the range
+    carries x, E[x^2] = a / (g (2 - g a)) E[n^2], and E[d^2] = (g^2 a)^2 E[x^2] + ((1 + g a)^2 + 1) E[n^2]. Without a loop
+    (B = 0: steered from outside) the measurement is n / g itself.
+    """
+    if dll_bw_hz == 0.0:
+        return 0.5 / gain**2
+    bt = dll_bw_hz * integration_s
+    a = 4.0 * bt / (1.0 + 2.0 * bt)
+    x = a / (gain * (2.0 - gain * a))
+    return x / ((gain * gain * a) ** 2 * x + (1.0 + gain * a) ** 2 + 1.0)
+
+
+@lru_cache(maxsize=512)
+def code_gain(signal: str, spacing_chips: float, cn0_dbhz: float, integration_s: float) -> float:
+    """Gain of the normalised code discriminator in noise (``nav.ultratight.discriminator_table``)."""
+    row = np.empty(4)
+    table = discriminator_table("L1CA" if signal == "G" else "E1", spacing_chips)
+    look_up(table, 10.0 ** (0.1 * cn0_dbhz) * integration_s, row)
+    return float(row[0])

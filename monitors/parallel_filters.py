@@ -26,7 +26,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from monitors.noise_rmd import tuned_variance
 from nav.errormodels import FOOT_M
-from nav.eskf_kernels import joseph_scalar, predict
+from nav.eskf_kernels import chain, joseph_scalar, predict
 
 MAX_SET_FILTERS = 70
 OLDEST, LEADING = 0, 1
@@ -457,3 +457,40 @@ class ParallelBank:
             self.p[0].copy(),
             declared >= 0,
         )
+
+
+class PacedBank:
+    """A ParallelBank on every n-th epoch of a filter that corrects its own trajectory in between.
+
+    The bank's states are relative to the trajectory as it was at its last epoch; what the filter has corrected since then
+    is carried along: m <- phi m + dx, z = r + H m.
+    """
+
+    def __init__(self, spec: ParallelFilters, m: int, p0: np.ndarray, every: int = 1):
+        self.bank, self.every = spec.start(m, p0), every
+        self._r0 = spec.r0_m2
+        n = p0.shape[0]
+        self._phi, self._qd, self._moved = np.eye(n), np.zeros((n, n)), np.zeros(n)
+        self._epoch = 0
+
+    def __call__(self, phi, qd, h, r, var, avail, dx, aids=None) -> BankReport | None:
+        """One epoch of the filter: ``r`` (m,) innovations that its correction ``dx`` (n,) followed; ``aids`` (h, r, var)."""
+        chain(self._phi, self._qd, phi, qd)
+        self._moved = phi @ self._moved
+        self._epoch += 1
+        if self._epoch % self.every:
+            self._moved += dx
+            return None
+        extra = (None, None, None) if aids is None else (aids[0], aids[1] + aids[0] @ self._moved, aids[2])
+        z, safe = r + h @ self._moved, np.where(avail, var + self._r0, 1.0)
+        report = self.bank(self._phi, self._qd, h, z, safe, avail, *extra)
+        self.bank.shift(self._moved + dx)
+        self._moved = np.zeros_like(self._moved)
+        self._phi, self._qd = np.eye(dx.size), np.zeros((dx.size, dx.size))
+        return report
+
+    def takeover(self) -> np.ndarray:
+        """dx (n,) that brings the filter to the bank's navigation filter; the bank's states move along."""
+        correction = self.bank.x[0].copy()
+        self.bank.shift(correction)
+        return correction
