@@ -352,7 +352,7 @@ class Navigator:
         if self._remedy is None:
             return own
         asked = self._asked(sats, "variance_m2", np.nan)
-        return np.where(np.isnan(asked), own, asked)
+        return np.where(np.isnan(asked), own, asked) * np.maximum(self._asked(sats, "weaken", 1.0), 1.0)
 
     def _own_variance(self, obs, sats):
         return pvt.range_variance(

@@ -18,6 +18,7 @@ REMEDY = np.dtype(
         ("variance_m2", "f8"),  # of the range, NaN: the receiver's own
         ("bias_m", "f8"),  # to subtract from the range
         ("exclude", "?"),
+        ("weaken", "f8"),  # factor on the variances; below 1: none
     ]
 )
 """What holds for one satellite from the next navigation epoch on."""

@@ -15,6 +15,7 @@ from nav import pvt
 from nav import ultratight_kernels as kernels
 from nav.imu import ImuSpec, OdometerSpec
 from nav.measurements import WEEK_MS
+from nav.navlog import Remedy
 from nav.records import SATELLITE, SOLUTION, STEERING
 from nav.riss import speed_at
 from nav.ultratight import (
@@ -40,6 +41,8 @@ SLOTS = 24
 """Channels that one filter can hold."""
 MIN_CN0_DBHZ = 30.0
 """A channel is taken over in phase lock at this C/N0 at the least."""
+LEFT_OUT = 1e12
+"""Factor on the variances of a satellite that a monitor excludes: it weighs nothing and is still steered."""
 REPORT_EVERY = 5
 """Epochs between new values of the slower columns of ``Steering.record``."""
 REFRESH_S = 1.0
@@ -107,7 +110,7 @@ class Steering:
     def _slots(self):
         self.active, self.slot = np.zeros(SLOTS, np.bool_), np.zeros(SLOTS, np.int64)
         self.second, self.period_s = np.zeros(SLOTS), np.full(SLOTS, 1e-3)
-        self.delay, self.delay_rate = np.zeros(SLOTS), np.zeros(SLOTS)
+        self.delay, self.delay_rate, self.bias = np.zeros(SLOTS), np.zeros(SLOTS), np.zeros(SLOTS)
         self.inflate, self.which = np.ones(SLOTS), np.zeros(SLOTS, np.int64)
         self.orbit, self.toe_toc_tgd = np.zeros((SLOTS, 19)), np.zeros((SLOTS, 3))
         self.name: list[tuple[str, int] | None] = [None] * SLOTS
@@ -215,7 +218,7 @@ class Steering:
             self.active[i], self.slot[i], self.name[i] = True, index, (signal, prn)
             self.second[i] = float(system != self._reference)
             self.period_s[i], self.which[i] = (1e-3, 0) if system == "G" else (4e-3, 1)
-            self.filter.power[i], self.inflate[i] = 0.0, 1.0
+            self.filter.power[i], self.inflate[i], self.bias[i] = 0.0, 1.0, 0.0
             self._set_orbit(i, newest[system, prn])
             self.filter.rho[i] = 2.2e7 + self.filter.clock()[0]
             self._next_refresh = 0
@@ -234,8 +237,26 @@ class Steering:
             raise ValueError(f"factor = {factor:g}: a variance is multiplied by something above zero")
         if (signal, prn) not in self.name:
             return False
-        self.inflate[self.name.index((signal, prn))] = factor
+        self.inflate[self.name.index((signal, prn))] = min(factor, LEFT_OUT)
         return True
+
+    def heed(self, remedy: Remedy | None, own_m2: dict[str, float]) -> None:
+        """What the monitors ask of each satellite from the next epoch on, through ``weaken``; and biases taken off its range.
+
+        ``own_m2``: the receiver's own range variances by name (G07); a larger one that was asked for counts as their ratio.
+        """
+        rows = (
+            {} if remedy is None else {f"{r['system'].decode()}{int(r['prn']):02d}": r for r in remedy.rows}
+        )
+        for i in np.flatnonzero(self.active):
+            signal, prn = self.name[i] or ("", 0)
+            name = f"{'G' if signal == 'L1CA' else 'E'}{prn:02d}"
+            row, factor = rows.get(name), 1.0
+            self.bias[i] = 0.0 if row is None else row["bias_m"]
+            if row is not None:
+                asked = row["variance_m2"] / own_m2.get(name, np.inf)
+                factor = LEFT_OUT if row["exclude"] else np.nanmax([1.0, row["weaken"], asked])
+            self.weaken(signal, prn, factor)
 
     def measure(self, rows, channels):
         """Turn the NCOs' TRANSMIT ``rows`` of steered ``channels`` into measurements: NCO plus discriminator, in place.
@@ -324,8 +345,8 @@ class Steering:
         nis, rows, seen = kernels.navigation_epoch(
             f.code, f.x, f.p, sensors, dt_s, f.filter_s, f.rates, f.q, self.spec.limit_sigma, self.spec.fast_cn0_s,
             self.spec.slow_cn0_s, self.spec.code_floor_m, self.spec.rate_floor_mps, sample, self.fs_hz, ms, frac_s, tow,
-            tow_frac, self.orbit, self.toe_toc_tgd, self.active, self.slot, self.second, self.period_s, self.delay,
-            self.delay_rate, self.inflate, self._tables, self.which, epochs, counts, f.power, f.cn0, f.rho, f.rate, f.accel,
+            tow_frac, self.orbit, self.toe_toc_tgd, self.active, self.slot, self.second, self.period_s,
+            self.delay + self.bias, self.delay_rate, self.inflate, self._tables, self.which, epochs, counts, f.power, f.cn0, f.rho, f.rate, f.accel,
             f.los, f.f, log["phi"][0], log["qd"][0], log["h"][0], log["r"][0], log["var"][0], log["used"][0], log["k"][0],
             log["s"][0], log["p"][0], f.dx, commands,
         )  # fmt: skip

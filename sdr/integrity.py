@@ -69,6 +69,7 @@ RESPONSE = np.dtype(
         ("variance_m2", "f8"),
         ("bias_m", "f8"),
         ("exclude", "?"),
+        ("weaken", "f8"),
     ]
 )
 """What was asked of the next epoch, one row per satellite that anything was asked of."""
@@ -126,7 +127,9 @@ class RespondSpec(BaseModel):
     ``noise``: range variances from this estimator; ``bias``: an identified bias is subtracted; ``exclude``: satellites that
     these monitors accuse are left out until ``hold_s`` after the last accusation (parallel filters: until re-certified);
     ``reset``: the filter takes the state and covariance of the parallel filter that never saw the fault; ``fallback``:
-    when faults of one constellation are too many to name, navigate by the other for ``hold_s``.
+    when faults of one constellation are too many to name, navigate by the other for ``hold_s``; ``weaken``: an alarm of an
+    interference monitor (``[[receiver.monitor]]``) raises the variances of the channel that it watches, until ``hold_s`` after.
+    All of it acts on the position and on a filter that steers the channels alike.
     """
 
     model_config = _FROZEN
@@ -140,6 +143,10 @@ class RespondSpec(BaseModel):
     """Take the state of the parallel filter that never saw the fault."""
     fallback: bool = False
     """Navigate by the other constellation when too many of one are faulty."""
+    weaken: tuple[str, ...] = ()
+    """Interference monitors, by name, whose alarms make a satellite weigh less."""
+    weaken_by: float = Field(100.0, gt=1, le=1e6)
+    """Factor on its variances."""
     hold_s: float = Field(10.0, gt=0, le=3600)
     """How long an action outlasts its cause."""
 
@@ -150,8 +157,9 @@ class RespondSpec(BaseModel):
 
     @model_validator(mode="after")
     def _twice(self):
-        if len(set(self.exclude)) != len(self.exclude):
-            raise ValueError("exclude names one monitor twice; write each once")
+        for key in ("exclude", "weaken"):
+            if len(set(getattr(self, key))) != len(getattr(self, key)):
+                raise ValueError(f"{key} names one monitor twice; write each once")
         return self
 
     def check(self, spec: IntegritySpec | None) -> None:

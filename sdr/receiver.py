@@ -14,9 +14,11 @@ from typing import Any, Protocol
 import numpy as np
 
 from nav.measurements import transmit_rows
+from nav.navlog import Remedy
 from nav.records import SOLUTION
 from nav.steering import Sensors, Steering
 from sdr.scenario import ReceiverSpec
+from sdr.watch import Flags
 from signals.modulation import SIGNALS
 from tracking.acquisition import acquire, slab_samples
 from tracking.channel import STATE_IDLE, STATE_LOCKED, STATE_LOST
@@ -86,6 +88,8 @@ class Receiver:
         self.steering = self._start_steering(sensors)
         self._aiding: np.ndarray | None = None
         self.monitors = [m.start(source.fs_hz) for m in spec.monitor]
+        respond = spec.respond
+        self.flags = Flags(respond.weaken, respond.weaken_by, respond.hold_s, self.fs_hz)
         self.integrity = spec.integrity.start(spec.respond, self.fs_hz) if spec.integrity else None
         if self.integrity is not None:
             self.integrity.watch(self.navigator)
@@ -232,7 +236,7 @@ class Receiver:
         rows = self.transmit(sample)
         solution = self.navigator.update(
             rows, self.telemetry.ephemerides(), self.telemetry.iono_utc("G"), self.telemetry.iono_utc("E"),
-            remedy=None if self.integrity is None else self.integrity.remedy,
+            remedy=self._remedy(sample),
         )  # fmt: skip
         seen = self.navigator.observations
         if len(seen) and seen["sample_index"][0] == sample:
@@ -244,6 +248,10 @@ class Receiver:
         if self.integrity is not None:
             # What it asks for holds from the next epoch on: the hand-over to navigation, one epoch later.
             out.integrity.append(self.integrity(self.navigator, sample))
+
+    def _remedy(self, sample: int) -> Remedy | None:
+        """What the monitors ask of the epoch that ends at ``sample``; None unless ``[receiver.respond]`` wants it."""
+        return self.flags.join(None if self.integrity is None else self.integrity.remedy, sample)
 
     def transmit(self, sample: int) -> np.ndarray:
         """TRANSMIT rows of the locked channels at one receiver sample; steered ones need no phase lock."""
@@ -257,7 +265,7 @@ class Receiver:
             sample, r["signal"], r["prn"], r["code_period"], [p for p, _ in reference], [t for _, t in reference],
             r["code_phase_chips"], r["doppler_hz"], r["carrier_phase_cycles"], r["cn0_dbhz"], r["lock_s"], slips,
         )  # fmt: skip
-        if self._steered:
+        if self.steering is not None and self._steered:
             self.steering.measure(rows, locked)
         return rows
 
@@ -314,6 +322,9 @@ class Receiver:
     def _steer(self, sample: int, epochs: np.ndarray, counts: np.ndarray, out: Outcome) -> None:
         steering = self.steering
         assert steering is not None
+        remedy, snap = self._remedy(sample), self.navigator.snapshot
+        if not self.spec.respond.off or self.flags.names:
+            steering.heed(remedy, {} if snap is None else dict(zip(snap.names, snap.own_m2)))
         self._aiding = steering.advance(
             sample, epochs, counts, self.tracker.channels["state"], self.telemetry.ephemerides
         )
@@ -366,7 +377,7 @@ class Receiver:
             self.integrity.hear(f"{'G' if gps else 'E'}{prn:02d}", epochs, loops)
 
     def _watch(self, out: Outcome) -> None:
-        """Let every monitor see the windows of taps; nothing comes back."""
+        """Let every monitor see the windows of taps; what comes back are flags, for the next epoch."""
         channels = self.tracker.channels
         for monitor in self.monitors:
             for c, epochs, corr in out.epochs:
@@ -378,6 +389,7 @@ class Receiver:
                 taps = self._nominal_taps(signal), self.tracker.taps_chips(c)[:k]
                 rows = monitor(signal, prn, epochs, corr[:, :k], taps, self.waveform(signal))
                 if len(rows):
+                    self.flags.note(monitor, rows)
                     out.statistics.append((monitor.spec.name, rows))
 
     def _nominal_taps(self, signal: str) -> np.ndarray:

@@ -70,6 +70,11 @@ class ReceiverSpec(BaseModel):
         twice = sorted({n for n in names if names.count(n) > 1})
         if twice:
             raise ValueError(f"two monitors are called '{twice[0]}': names must differ")
+        missing = [n for n in self.respond.weaken if n not in names]
+        if missing:
+            raise ValueError(
+                f"receiver.respond.weaken wants an answer of '{missing[0]}', which is off: add [[receiver.monitor]] of that name"
+            )
         loops = {"G": ("l1ca", self.tracking.l1ca), "E": ("e1", self.tracking.e1)}
         for system in self.acquisition.systems:
             section, spec = loops[system]

@@ -23,6 +23,7 @@ from monitors.glrt import GlrtMonitor
 from monitors.multichannel_ar import MultichannelAr
 from monitors.records import STATISTIC, alarms
 from monitors.threshold import ParetoNull, per_epoch
+from nav.navlog import REMEDY, Remedy
 from signals.multipath import MultipathSpec
 from tracking.channel import STATE_LOCKED
 from tracking.correlator_model import Twin
@@ -33,8 +34,6 @@ Detector = Annotated[
 ]
 EPOCH_S = {"L1CA": 0.02, "E1B": 0.1, "E1C": 0.1}
 """Length of a monitor's epoch; the AR model needs more vectors than 100 ms give and takes 20 ms of E1 too."""
-BATCH_S = 1.0
-"""Monitors are called this often: a call costs more than an epoch."""
 NULL_EPOCHS = 102_400
 """Quiet epochs of the twin behind a threshold of the FFT or AR monitor."""
 MONITOR = np.dtype([("signal", "S4"), ("prn", "i4"), *((n, STATISTIC[n]) for n in STATISTIC.names or ())])
@@ -74,6 +73,8 @@ class WatchSpec(BaseModel):
     settle_s: float = Field(3.0, ge=0)  # after lock, before training
     training_s: float = Field(20.0, gt=1, le=3600)
     """Seconds of each channel that train its monitor."""
+    batch_s: float = Field(1.0, ge=0.02, le=10)
+    """Statistics are computed this often: a call costs more than an epoch, and an answer cannot come sooner."""
     gap_s: float = Field(1.0, ge=0)  # exceedances closer than this are one alarm
 
     def start(self, fs_hz: float) -> "Watch":
@@ -115,6 +116,38 @@ class Watch:
     def alarms(self) -> dict[tuple[str, int], np.ndarray]:
         """{(signal, prn): ALARM rows} so far, of the channels whose training is complete."""
         return {k: c.alarms() for k, c in self.channels.items() if c.threshold is not None}
+
+
+class Flags:
+    """Satellites that the alarms of ``names`` weaken by ``factor``, each until ``hold_s`` after its last exceedance."""
+
+    def __init__(self, names: tuple[str, ...], factor: float, hold_s: float, fs_hz: float) -> None:
+        self.names, self.factor, self.hold = names, factor, round(hold_s * fs_hz)
+        self._until: dict[tuple[bytes, int], int] = {}
+
+    def note(self, watch: Watch, rows: np.ndarray) -> None:
+        """Look at the MONITOR rows that a monitor just gave."""
+        if watch.spec.name not in self.names:
+            return
+        for row in rows:
+            threshold = watch.channels[row["signal"].decode(), int(row["prn"])].threshold
+            if threshold is not None and row["value"] >= threshold:
+                key = (b"G" if row["signal"] == b"L1CA" else b"E"), int(row["prn"])
+                self._until[key] = int(row["sample_index"]) + self.hold
+
+    def join(self, remedy: Remedy | None, sample: int) -> Remedy | None:
+        """What the integrity monitors ask for, and what is flagged at ``sample`` on top."""
+        flagged = [key for key, until in sorted(self._until.items()) if sample <= until]
+        if not flagged:
+            return remedy
+        rows = np.zeros(0, REMEDY) if remedy is None else remedy.rows.copy()
+        at = Remedy(rows).find([s for s, _ in flagged], [n for _, n in flagged])
+        rows["weaken"][at[at >= 0]] = self.factor
+        new = np.zeros(int(np.sum(at < 0)), REMEDY)
+        for row, (system, prn) in zip(new, [key for key, i in zip(flagged, at) if i < 0]):
+            row["system"], row["prn"], row["variance_m2"], row["weaken"] = system, prn, np.nan, self.factor
+        rows = np.concatenate([rows, new])
+        return Remedy(rows) if remedy is None else remedy._replace(rows=rows)
 
 
 class _Channel:
@@ -162,7 +195,7 @@ class _Channel:
             self._cn0 += e["cn0_dbhz"][settled].tolist() if self.threshold is None else []
             self._take(e[settled], corr[part][settled])
             # Always the same batches, however the samples were cut into slabs.
-            n = round(BATCH_S / self.epoch_s)
+            n = max(1, round(self.spec.batch_s / self.epoch_s))
             while sum(map(len, self._waiting)) >= n:
                 out.append(self.batch(n))
         return np.concatenate(out) if out else np.empty(0, MONITOR)

@@ -313,3 +313,23 @@ def test_refusals(receiver, words):
     with pytest.raises(ValidationError) as error:
         ReceiverSpec.model_validate(receiver)
     assert all(w in str(error.value) for w in words)
+
+
+def test_a_weakened_satellite_counts_less_and_a_factor_below_one_changes_no_bit(sky):
+    nav = NavigationSpec(**LEAST_SQUARES)
+    eph, rng = ephemerides(sky), np.random.default_rng(3)
+    observed = transmit(sky, T0, SIGMA_M, 0.05, rng, None)
+    bad = observed.copy()
+    bad["tow_tx_frac_s"][0] -= 30.0 / 299_792_458.0
+    rows = np.zeros(1, REMEDY)
+    rows["system"], rows["prn"], rows["variance_m2"] = observed["system"][0], observed["prn"][0], np.nan
+
+    def fix(transmitted, remedy=None):
+        run = nav.start(FS_HZ)
+        run.update(transmitted, eph, sky.iono_utc, sky.iono_utc)  # the first fix sets the clock
+        return run.update(transmitted, eph, sky.iono_utc, sky.iono_utc, remedy=remedy)["pos_ecef_m"]
+
+    assert np.array_equal(fix(bad), fix(bad, Remedy(rows)))
+    moved = np.linalg.norm(fix(bad) - fix(observed))
+    rows["weaken"] = 1e6
+    assert np.linalg.norm(fix(bad, Remedy(rows)) - fix(observed, Remedy(rows))) < 0.01 * moved

@@ -7,8 +7,9 @@ from nav import ultratight as ut
 from nav import ultratight_kernels as kernels
 from nav.errormodels import Ecef17
 from nav.imu import ImuSpec, OdometerSpec
+from nav.navlog import REMEDY, Remedy
 from nav.riss import Riss11, RissSf
-from nav.steering import Sensors, Steering
+from nav.steering import LEFT_OUT, Sensors, Steering
 from nav.ultratight import Filter, Kinematic, SteeringSpec, discriminator_table, nominal_of, start_covariance
 from sdr.uttwin import Policy, Sky, Trial, batch, drive, summary
 from sdr.uttwin_kernels import correlate
@@ -328,6 +329,23 @@ def test_a_filter_that_knows_too_little_lets_go():
     assert steering.state == ut.LOST
     assert steering.filter is None
     assert "a range is predicted no better than" in steering.reason
+
+
+def test_what_monitors_ask_reaches_the_filter_in_the_next_epoch_and_ends_with_it():
+    steering = Steering(SteeringSpec(mode="vector"), 4e6, None, SPACING)
+    steering.active[:4], steering.name[:4] = True, [("L1CA", 3), ("L1CA", 7), ("E1C", 7), ("L1CA", 9)]
+    rows = np.zeros(3, REMEDY)
+    rows["system"], rows["prn"], rows["variance_m2"] = [b"G", b"E", b"G"], [3, 7, 9], [np.nan, np.nan, 8.0]
+    rows["weaken"][0], rows["exclude"][1], rows["bias_m"][2] = 100.0, True, 15.0
+    steering.heed(Remedy(rows), {"G03": 2.0, "G07": 2.0, "G09": 2.0})
+    assert steering.inflate[:4].tolist() == [100.0, 1.0, LEFT_OUT, 4.0]
+    assert steering.bias[:4].tolist() == [0.0, 0.0, 0.0, 15.0]
+    steering.heed(None, {})
+    assert np.all(steering.inflate == 1.0)
+    assert not steering.bias.any()
+    with pytest.raises(ValueError, match="above zero"):
+        steering.weaken("L1CA", 3, 0.0)
+    assert not steering.weaken("L1CA", 30, 2.0)
 
 
 @pytest.mark.parametrize(

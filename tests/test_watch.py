@@ -1,14 +1,16 @@
 """Live monitors: thresholds, alarms on a jammed channel, and no influence on the receiver."""
 
 import json
+from types import SimpleNamespace
 
 import h5py
 import numpy as np
 import pytest
 
+from nav.navlog import REMEDY, Remedy
 from sdr import jobs, scenario
 from sdr.scenario import ReceiverSpec
-from sdr.watch import MONITOR, WatchSpec
+from sdr.watch import MONITOR, Flags, WatchSpec
 from signals.modulation import SIGNALS
 from tracking.channel import STATE_LOCKED
 from tracking.correlator_model import Twin, TwinCW
@@ -136,3 +138,37 @@ def test_a_jammed_approach(tmp_path):
                 assert a[f"tracking/{name}/{part}"][:].tobytes() == group[part][:].tobytes()
         if "navigation/solution" in b:
             assert a["navigation/solution"][:].tobytes() == b["navigation/solution"][:].tobytes()
+
+
+def test_an_alarm_weakens_its_satellite_until_the_hold_is_over():
+    spec = WatchSpec.model_validate({"name": "fast", "detector": {"kind": "CN0"}})
+    watch = spec.start(1000.0)
+    watch.channels["L1CA", 7] = SimpleNamespace(threshold=5.0)
+    watch.channels["E1C", 11] = SimpleNamespace(threshold=None)  # still in training
+    flags = Flags(("fast",), 50.0, 2.0, 1000.0)
+    rows = np.zeros(3, MONITOR)
+    rows["signal"], rows["prn"], rows["value"] = [b"L1CA", b"L1CA", b"E1C"], [7, 7, 11], [4.9, 5.0, 99.0]
+    rows["sample_index"] = [9_000, 10_000, 10_000]
+    assert flags.join(None, 0) is None
+    flags.note(watch, rows)
+    weak = flags.join(None, 12_000).rows
+    assert [(r["system"], r["prn"], r["weaken"]) for r in weak] == [(b"G", 7, 50.0)]
+    assert np.isnan(weak["variance_m2"][0])
+    assert flags.join(None, 12_001) is None
+    # On top of what the integrity monitors ask, row by row.
+    asked = np.zeros(2, REMEDY)
+    asked["system"], asked["prn"], asked["bias_m"], asked["variance_m2"] = b"G", [3, 7], 4.0, np.nan
+    both = flags.join(Remedy(asked, dx=np.ones(9)), 12_000)
+    assert both.rows["weaken"].tolist() == [0.0, 50.0]
+    assert both.rows["bias_m"].tolist() == [4.0, 4.0]
+    assert both.dx.tolist() == [1.0] * 9
+    assert asked["weaken"].tolist() == [0.0, 0.0]
+    # Other monitors have no say.
+    quiet = Flags((), 50.0, 2.0, 1000.0)
+    quiet.note(watch, rows)
+    assert quiet.join(None, 10_000) is None
+
+
+def test_an_answer_of_a_monitor_that_is_off_is_refused():
+    with pytest.raises(ValueError, match="wants an answer of 'fft', which is off"):
+        ReceiverSpec.model_validate({"respond": {"weaken": ["fft"]}})
