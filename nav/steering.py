@@ -31,7 +31,7 @@ from nav.ultratight import (
     nominal_of,
     start_covariance,
 )
-from signals.constants import C_MPS, SECONDS_PER_WEEK, WAVELENGTH_M
+from signals.constants import C_MPS, METRES_PER_CHIP, SECONDS_PER_WEEK, WAVELENGTH_M
 from signals.orbits import orbit_coefficients
 from signals.records import EPHEMERIS
 from tracking.lock import STATE_LOCKED
@@ -41,12 +41,16 @@ SLOTS = 24
 """Channels that one filter can hold."""
 MIN_CN0_DBHZ = 30.0
 """A channel is taken over in phase lock at this C/N0 at the least."""
+ISB_SIGMA_M = 5.0
+"""Of an inter-system bias that a scalar fix gave."""
 LEFT_OUT = 1e12
 """Factor on the variances of a satellite that a monitor excludes: it weighs nothing and is still steered."""
 REPORT_EVERY = 5
 """Epochs between new values of the slower columns of ``Steering.record``."""
 REFRESH_S = 1.0
 """Atmosphere and ephemerides are renewed this often."""
+MISSING_S = 5.0
+"""A vector receiver that misses more satellites than it hears for this long lets go: its replicas are elsewhere."""
 INCONSISTENT_RATIO = 6.0
 """Mean of NIS over its degrees of freedom through a second, beyond which the filter is not believed."""
 
@@ -100,21 +104,25 @@ class Steering:
                 discriminator_table("E1", spacing_chips["E1"]),
             ]
         )
+        if spec.code_noise_m is not None:
+            # Of the true range: what a discriminator of lower gain shows is smaller.
+            self._tables[:, :, 1] = (self._tables[:, :, 0] * spec.code_noise_m / METRES_PER_CHIP) ** 2
+        self.log_length = 256
         self.state, self.reason, self.filter = SCALAR, "waiting for a scalar fix", None
         self.record = np.zeros(1, STEERING)
         self.sample = -1
         self._fix_since = self._coast_since = -1
-        self._n_released = 0
+        self._n_released, self._estimate_isb, self._reference = 0, False, "G"
         self._slots()
 
     def _slots(self):
         self.active, self.slot = np.zeros(SLOTS, np.bool_), np.zeros(SLOTS, np.int64)
         self.second, self.period_s = np.zeros(SLOTS), np.full(SLOTS, 1e-3)
         self.delay, self.delay_rate, self.bias = np.zeros(SLOTS), np.zeros(SLOTS), np.zeros(SLOTS)
-        self.inflate, self.which = np.ones(SLOTS), np.zeros(SLOTS, np.int64)
+        self.inflate, self.which = np.ones(2 * SLOTS), np.zeros(SLOTS, np.int64)
         self.orbit, self.toe_toc_tgd = np.zeros((SLOTS, 19)), np.zeros((SLOTS, 3))
         self.name: list[tuple[str, int] | None] = [None] * SLOTS
-        self._ratio, self._next_refresh = 1.0, 0
+        self._ratio, self._missing_s, self._next_refresh = 1.0, 0.0, 0
 
     def _read_sensors(self):
         assert self.sensors is not None
@@ -150,15 +158,15 @@ class Steering:
             self.reason = "scalar fixes settle"
             return False
         clock, bias_m, isb_m = navigator.handover()
+        has_gps = any(signal == "L1CA" for _, signal, _, _ in channels)
+        self._reference = "G" if has_gps else "E"
         try:
-            self._begin(sample, solution, bias_m, isb_m)
+            self._begin(sample, solution, bias_m)
         except ValueError as err:
             self.reason = str(err)
             return False
+        self.meet(isb_m)
         self._clock, self._klobuchar = clock, klobuchar
-        self._estimate_isb = isb_m is not None
-        has_gps = any(signal == "L1CA" for _, signal, _, _ in channels)
-        self._reference = "G" if has_gps else "E"
         self.sample = sample
         self._predict_only(sample)
         self.take(channels, ephemerides)
@@ -171,7 +179,7 @@ class Steering:
         self.state, self.reason, self._coast_since = STEERED, "", -1
         return True
 
-    def _begin(self, sample, solution, bias_m, isb_m):
+    def _begin(self, sample, solution, bias_m):
         pos, vel = np.array(solution["pos_ecef_m"]), np.array(solution["vel_ecef_mps"])
         azimuth = None if self.spec.heading_deg is None else math.radians(self.spec.heading_deg)
         speed = None
@@ -181,16 +189,26 @@ class Steering:
             )
             speed = float(self._table[max(row, 0), 6])
         x = nominal_of(
-            self.model, pos, vel, bias_m, float(solution["clock_drift_mps"]), isb_m or 0.0, azimuth,
+            self.model, pos, vel, bias_m, float(solution["clock_drift_mps"]), 0.0, azimuth,
             speed if self.spec.model != "ecef17" else None,
         )  # fmt: skip
         moving = max(float(np.linalg.norm(vel)), 1.0)
         imu = self.sensors.imu_spec if self.sensors else None
         p = start_covariance(
             self.model, x, pos_m=self.spec.range_sigma_m, vel_mps=0.2, bias_m=2.0 * self.spec.range_sigma_m, drift_mps=0.3,
-            heading_rad=min(0.01 + 0.25 / moving, 0.3), isb_m=5.0 if isb_m is not None else 300.0, imu=imu,
+            heading_rad=min(0.01 + 0.25 / moving, 0.3), imu=imu,
         )  # fmt: skip
-        self.filter = Filter(self.spec, self.model, x, p, SLOTS)
+        self.filter, self._estimate_isb = Filter(self.spec, self.model, x, p, SLOTS, self.log_length), False
+
+    def meet(self, isb_m: float | None) -> None:
+        """Learn Galileo's clock minus GPS's from the position stage; until then only the first system is steered."""
+        if self._estimate_isb or isb_m is None:
+            return
+        f = self.filter
+        f.x[kernels.ISB] = isb_m if self._reference == "G" else -isb_m
+        f.p[-1, :] = f.p[:, -1] = 0.0
+        f.p[-1, -1] = ISB_SIGMA_M**2
+        self._estimate_isb = True
 
     def release(self, reason: str) -> np.ndarray:
         """Let all channels go."""
@@ -218,7 +236,7 @@ class Steering:
             self.active[i], self.slot[i], self.name[i] = True, index, (signal, prn)
             self.second[i] = float(system != self._reference)
             self.period_s[i], self.which[i] = (1e-3, 0) if system == "G" else (4e-3, 1)
-            self.filter.power[i], self.inflate[i], self.bias[i] = 0.0, 1.0, 0.0
+            self.filter.power[i], self.inflate[[i, SLOTS + i]], self.bias[i] = 0.0, 1.0, 0.0
             self._set_orbit(i, newest[system, prn])
             self.filter.rho[i] = 2.2e7 + self.filter.clock()[0]
             self._next_refresh = 0
@@ -237,13 +255,15 @@ class Steering:
             raise ValueError(f"factor = {factor:g}: a variance is multiplied by something above zero")
         if (signal, prn) not in self.name:
             return False
-        self.inflate[self.name.index((signal, prn))] = min(factor, LEFT_OUT)
+        i = self.name.index((signal, prn))
+        self.inflate[[i, SLOTS + i]] = min(factor, LEFT_OUT)
         return True
 
     def heed(self, remedy: Remedy | None, own_m2: dict[str, float]) -> None:
         """What the monitors ask of each satellite from the next epoch on, through ``weaken``; and biases taken off its range.
 
-        ``own_m2``: the receiver's own range variances by name (G07); a larger one that was asked for counts as their ratio.
+        ``own_m2``: the receiver's own range variances by name (G07), to which one that was asked for is in proportion; it
+        acts on the range alone.
         """
         rows = (
             {} if remedy is None else {f"{r['system'].decode()}{int(r['prn']):02d}": r for r in remedy.rows}
@@ -254,9 +274,10 @@ class Steering:
             row, factor = rows.get(name), 1.0
             self.bias[i] = 0.0 if row is None else row["bias_m"]
             if row is not None:
-                asked = row["variance_m2"] / own_m2.get(name, np.inf)
-                factor = LEFT_OUT if row["exclude"] else np.nanmax([1.0, row["weaken"], asked])
+                factor = LEFT_OUT if row["exclude"] else max(1.0, row["weaken"])
             self.weaken(signal, prn, factor)
+            if row is not None and row["variance_m2"] > 0 and name in own_m2:
+                self.inflate[i] = min(factor * row["variance_m2"] / own_m2[name], LEFT_OUT)
 
     def measure(self, rows, channels):
         """Turn the NCOs' TRANSMIT ``rows`` of steered ``channels`` into measurements: NCO plus discriminator, in place.
@@ -346,10 +367,12 @@ class Steering:
             f.code, f.x, f.p, sensors, dt_s, f.filter_s, f.rates, f.q, self.spec.limit_sigma, self.spec.fast_cn0_s,
             self.spec.slow_cn0_s, self.spec.code_floor_m, self.spec.rate_floor_mps, sample, self.fs_hz, ms, frac_s, tow,
             tow_frac, self.orbit, self.toe_toc_tgd, self.active, self.slot, self.second, self.period_s,
-            self.delay + self.bias, self.delay_rate, self.inflate, self._tables, self.which, epochs, counts, f.power, f.cn0, f.rho, f.rate, f.accel,
-            f.los, f.f, log["phi"][0], log["qd"][0], log["h"][0], log["r"][0], log["var"][0], log["used"][0], log["k"][0],
-            log["s"][0], log["p"][0], f.dx, commands,
+            self.delay + self.bias, self.delay_rate, self.inflate, self._tables, self.which, epochs, counts, f.power, f.cn0,
+            f.rho, f.rate, f.accel, f.los, f.f, log["phi"][0], log["qd"][0], log["h"][0], log["r"][0], log["var"][0], f.own,
+            log["used"][0], log["k"][0], log["s"][0], log["p"][0], f.dx, commands,
         )  # fmt: skip
+        # Rows that weigh nothing are no degrees of freedom.
+        rows -= int(np.sum((f.own > 0) & (self.inflate >= LEFT_OUT)))
         f.nis, f.n_rows = nis, rows
         self.sample = sample
         return nis, rows, seen
@@ -379,6 +402,8 @@ class Steering:
         sigma = np.zeros(2)
         kernels.predicted_sigma(f.code, f.x, f.p, f.los, self.active, sigma)
         self.sigma, self.usable = sigma, usable
+        missing, heard = f.missing(self.active)
+        self._missing_s = self._missing_s + 1.0 / self.spec.update_hz if missing > heard > 0 else 0.0
         if usable >= 1:
             self.state, self._coast_since = STEERED, -1
         else:
@@ -393,6 +418,8 @@ class Steering:
             )
         elif sigma[1] > self.spec.release_rate_mps:
             why = f"a rate is predicted no better than {sigma[1]:.1f} m/s: too coarse for the frequency discriminator"
+        elif self.spec.mode == "vector" and self._missing_s > MISSING_S:
+            why = f"{missing} satellites are not where they are predicted, {heard} are"
         elif usable >= self.spec.min_satellites and self._ratio > INCONSISTENT_RATIO:
             why = f"innovations are {self._ratio:.0f} times what the filter expects"
         if why:

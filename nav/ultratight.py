@@ -82,6 +82,8 @@ class SteeringSpec(BaseModel):
     """Innovations beyond it are weighed down to it; 0: never."""
     code_floor_m: Annotated[float, Field(ge=0)] = 0.05
     """Least standard deviation of a range."""
+    code_noise_m: Annotated[float | None, Field(gt=0, le=1000)] = None
+    """Range noise of one integration that the filter believes, whatever the C/N0; None: by the C/N0, as it should be."""
     rate_floor_mps: Annotated[float, Field(ge=0)] = 0.01
     """Least standard deviation of a range rate."""
     range_sigma_m: Annotated[float, Field(gt=0)] = 3.0
@@ -263,7 +265,11 @@ def extended_q(model, x) -> np.ndarray:
 
 
 class Filter:
-    """State and workspace of one steering filter for C channel slots; ``log`` is what the monitors read."""
+    """State and workspace of one steering filter for C channel slots.
+
+    ``log`` is what the monitors read, and ``own`` (2C,): the last epoch's variances before any answer of theirs, 0 where a
+    channel was not heard.
+    """
 
     def __init__(self, spec: SteeringSpec, model, x, p, n_channels, log_length=256):
         self.spec, self.model, self.code = spec, model, model_code(model)
@@ -279,7 +285,8 @@ class Filter:
             np.zeros(n_channels),
         )
         self.los = np.zeros((n_channels, 3))
-        self.nis, self.n_rows, self.epochs = math.nan, 0, 0
+        self.own = np.zeros(m)
+        self.nis, self.n_rows, self.epochs, self._first = math.nan, 0, 0, 0
         self._ring = empty_log(log_length, n, m)
 
     def slot(self) -> dict[str, np.ndarray]:
@@ -290,7 +297,7 @@ class Filter:
 
     def log(self, n_epochs: int | None = None) -> EpochLog:
         """The last ``n_epochs`` epochs, oldest first (copies)."""
-        have = min(self.epochs, self._ring.t_s.size)
+        have = min(self.epochs - self._first, self._ring.t_s.size)
         want = have if n_epochs is None else n_epochs
         if want > have:
             raise ValueError(
@@ -298,6 +305,19 @@ class Filter:
             )
         index = np.arange(self.epochs - want, self.epochs) % self._ring.t_s.size
         return EpochLog(*(array[index] for array in self._ring))
+
+    def last(self) -> EpochLog:
+        """The last epoch (views)."""
+        i = (self.epochs - 1) % self._ring.t_s.size
+        return EpochLog(*(array[i] for array in self._ring))
+
+    def correct(self, dx: np.ndarray | None, p: np.ndarray | None) -> None:
+        """Between two epochs: inject dx = true - estimate, replace the covariance; what was logged is another filter's."""
+        if dx is not None:
+            kernels.inject(self.code, self.x, dx)
+        if p is not None:
+            self.p[:] = p
+            self._first = self.epochs
 
     def position(self) -> tuple[np.ndarray, np.ndarray]:
         """ECEF position and velocity."""
@@ -309,6 +329,17 @@ class Filter:
         """Clock bias (m) and drift (m/s)."""
         cb, cd = kernels.clock_columns(self.code)
         return float(self.x[cb]), float(self.x[cd])
+
+    def missing(self, active) -> tuple[int, int]:
+        """Active channels that should stand out of the noise (their own strength is remembered) and do not; those that do."""
+        power = self.power[active]
+        noise = power[:, kernels.N_FAST]
+        should = power[:, kernels.SIGNAL] > kernels.STRONG * noise
+        there = (
+            np.minimum(power[:, kernels.P_FAST], power[:, kernels.P_SLOW]) > (1.0 + kernels.STRONG) * noise
+        )
+        gone = power[:, kernels.P_FAST] < 4.0 * noise
+        return int(np.sum(should & gone)), int(np.sum(should & there))
 
     def covariance(self) -> np.ndarray:
         """Covariance of the ECEF position (3, 3), m^2."""

@@ -326,6 +326,8 @@ def cn0_from_powers(power, active, span_s, cn0_out):
         elif power[c, SIGNAL] > 0.0:
             # Among noise the estimate scatters upwards to gains and weights that are not there: a signal gets no stronger.
             cn0_out[c] = min(cn0_out[c], power[c, SIGNAL] / density)
+            if power[c, SIGNAL] * span_s[c] > STRONG * density and value * span_s[c] < 1.0:
+                cn0_out[c] = 0.5  # it should stand out and does not: what is left is noise alone
         power[c, CN0_HZ] = cn0_out[c]
 
 
@@ -496,7 +498,7 @@ def read_epochs(epochs, counts, slot, active, period_s, sample, fs_hz, rx_frac_s
 @njit(cache=True, nogil=True)
 def weigh(code_m, rate_mps, off_m, off_mps, span_s, seen, cn0, inflate, tables, which, floor_m, floor_mps, z, var, used,
           gain_code, gain_rate):  # fmt: skip
-    """Innovations, variances and gains of all rows from the discriminators and the fast C/N0."""
+    """Innovations, variances and gains of all rows from the discriminators and the fast C/N0; ``inflate`` (2C,)."""
     count = seen.size
     row = np.empty(4)
     for c in range(count):
@@ -508,8 +510,8 @@ def weigh(code_m, rate_mps, off_m, off_mps, span_s, seen, cn0, inflate, tables, 
         z[c] = code_m[c] + row[0] * off_m[c]
         z[count + c] = rate_mps[c] + row[2] * off_mps[c]
         per_hz = WAVELENGTH_M / (0.5 * span_s[c])
-        var[c] = inflate[c] * row[1] * METRES_PER_CHIP**2 / seen[c] + (row[0] * floor_m) ** 2
-        var[count + c] = inflate[c] * row[3] * per_hz**2 / seen[c] + (row[2] * floor_mps) ** 2
+        var[c] = inflate[c] * (row[1] * METRES_PER_CHIP**2 / seen[c] + (row[0] * floor_m) ** 2)
+        var[count + c] = inflate[count + c] * (row[3] * per_hz**2 / seen[c] + (row[2] * floor_mps) ** 2)
 
 
 @njit(cache=True, nogil=True)
@@ -559,10 +561,11 @@ def steer(active, slot, period_s, sample, rx_ms, rx_frac_s, rho, rate, accel, le
 def navigation_epoch(model, x, p, sensors, dt_s, filter_s, rates, q_diag, limit, fast_s, slow_s, floor_m, floor_mps,
                      sample, fs_hz, rx_ms, rx_frac_s, tow_whole, tow_frac, orbit, toe_toc_tgd, active, slot, second,
                      period_s, delay, delay_rate, inflate, tables, which, epochs, counts, power, cn0, rho, rate, accel,
-                     los, f, phi, qd, h, z, var, used, k, s, p_prior, dx, commands):  # fmt: skip
+                     los, f, phi, qd, h, z, var, own, used, k, s, p_prior, dx, commands):  # fmt: skip
     """Predict, update from every channel's discriminators and steer: one call per navigation epoch.
 
-    The epoch ends at receiver ``sample``; commands hold from there on. Returns (NIS, rows, channels seen).
+    The epoch ends at receiver ``sample``; commands hold from there on. ``inflate`` (2C,) multiplies the variances of ranges
+    and rates, ``own`` (2C,) receives them without it, 0 where nothing was heard. Returns (NIS, rows, channels seen).
     """
     n, count = p.shape[0], active.size
     sat_pos, sat_vel, sat_acc = np.empty((count, 3)), np.empty((count, 3)), np.empty((count, 3))
@@ -591,6 +594,7 @@ def navigation_epoch(model, x, p, sensors, dt_s, filter_s, rates, q_diag, limit,
         code_m, rate_mps, off_m, off_mps, span_s, seen, cn0, inflate, tables, which, floor_m, floor_mps, z, var, used,
         gain_code, gain_rate,
     )  # fmt: skip
+    own[:] = np.where(used, var / inflate, 0.0)
     rows(model, x, n, los, second, gain_code, gain_rate, tp, tv, h)
     nis, n_rows = filter_update(model, x, p, h, z, var, used, power, limit, k, s, p_prior, dx)
     before_m, before_mps = rho.copy(), rate.copy()

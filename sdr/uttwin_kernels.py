@@ -122,7 +122,7 @@ def aided_run(rng, model, x, p, sensors, per_epoch, dt_s, filter_s, rates, q_dia
     active, second = np.ones(count, np.bool_), np.zeros(count)
     zeros, which = np.zeros(count), np.zeros(count, np.int64)
     rho, rate, accel, los = np.zeros(count), np.zeros(count), np.zeros(count), np.zeros((count, 3))
-    span_s, seen, inflate = np.full(count, T), np.ones(count, np.int64), np.ones(count)
+    span_s, seen, inflate = np.full(count, T), np.ones(count, np.int64), np.ones(2 * count)
     power, cn0 = np.zeros((count, N_CN0)), np.full(count, 1e4)
     code_m, rate_mps, off_m, off_mps = np.zeros(count), np.zeros(count), np.zeros(count), np.zeros(count)
     gain_code, gain_rate = np.ones(count), np.ones(count)

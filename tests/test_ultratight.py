@@ -164,7 +164,7 @@ def test_nco_state_is_the_point_of_linearisation(period_s):
         *out,
         seen,
         np.array([300.0]),
-        np.ones(1),
+        np.ones(2),
         table,
         np.zeros(1, np.int64),
         0.0,
