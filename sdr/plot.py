@@ -16,19 +16,28 @@ SIZE_IN = (9.0, 5.0)
 
 @contextlib.contextmanager
 def figure(
-    path: Path, title: str, rows: int = 1, projection: str | None = None, size: tuple[float, float] = SIZE_IN
+    path: Path,
+    title: str,
+    rows: int = 1,
+    projection: str | None = None,
+    size: tuple[float, float] = SIZE_IN,
+    widths: tuple[float, ...] = (1.0,),
 ) -> Iterator[Any]:
-    """A figure of ``rows`` axes sharing x, saved to ``path`` and closed on leaving."""
+    """A figure of ``rows`` axes sharing x (in columns of ``widths``), saved to ``path`` on leaving."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     fig = Figure(figsize=size, layout="constrained")
     FigureCanvasAgg(fig)
     axes = fig.subplots(
-        rows, 1, sharex=rows > 1, subplot_kw={"projection": projection} if projection else None
+        rows,
+        len(widths),
+        sharex="col" if rows > 1 else False,
+        width_ratios=widths,
+        subplot_kw={"projection": projection} if projection else None,
     )
     fig.suptitle(title)
-    for ax in np.atleast_1d(axes):
+    for ax in np.ravel(axes):
         ax.grid(alpha=0.3)
     yield axes
     fig.savefig(path, dpi=130)
@@ -75,6 +84,7 @@ def _label(group: h5py.Group) -> str:
 
 
 def _tracking_errors(h5: h5py.File, channels: dict[str, h5py.Group], directory: Path) -> Path | None:
+    """Errors in time, all satellites; beside them each satellite's rms against its thermal sigma."""
     with_truth = {}
     for name, group in channels.items():
         attrs = group["epochs"].attrs
@@ -84,35 +94,50 @@ def _tracking_errors(h5: h5py.File, channels: dict[str, h5py.Group], directory: 
     if not with_truth:
         return None
     path = directory / "tracking_errors.png"
-    keys = {
-        "code_m": "code (m)",
-        "phase_cycles": "phase (cycle)",
-        "doppler_hz": "Doppler (Hz)",
-        "code_minus_carrier_m": "code − carrier (m)",
-    }
-    with figure(path, "Tracking errors: replica minus truth", rows=4, size=(9, 10)) as axes:
-        for name, errors in with_truth.items():
-            group = channels[name]
-            settled = errors["t_s"] > errors["t_s"][0] + 2.0 if len(errors["t_s"]) else slice(None)
-            for ax, key in zip(axes, keys):
-                ax.plot(errors["t_s"][settled], errors[key][settled], lw=0.6, label=_label(group))
-        for ax, (key, label) in zip(axes, keys.items()):
-            _theory_band(ax, key, channels)
-            ax.set_ylabel(label)
-            span = np.concatenate([e[key][len(e[key]) // 4 :] for e in with_truth.values()])
-            limit = 1.3 * float(np.quantile(np.abs(span), 0.999)) if span.size else 1.0
-            ax.set_ylim(-limit or -1, limit or 1)
-        axes[-1].set_xlabel("time (s)")
-        axes[0].legend(ncol=10, fontsize=7, loc="upper right")
+    with figure(
+        path, "Tracking errors: replica minus truth", rows=4, size=(12, 10), widths=(3.0, 1.0)
+    ) as axes:
+        for row, (key, label, theory) in zip(axes, ERRORS, strict=True):
+            _one_error(row, key, theory, with_truth, channels)
+            row[0].set_ylabel(label)
+        axes[-1, 0].set_xlabel("time (s)")
+        axes[-1, 1].tick_params(axis="x", rotation=90, labelsize=7)
+        axes[0, 1].set_title("rms of each satellite", fontsize=9)
+        axes[0, 1].legend(fontsize=7)
     return path
 
 
-def _theory_band(ax: Any, key: str, channels: dict[str, h5py.Group]) -> None:
-    attr = {"code_m": "code_sigma_m", "phase_cycles": "phase_sigma_cycles"}.get(key)
-    sigmas = [float(g["epochs"].attrs[attr]) for g in channels.values() if attr and attr in g["epochs"].attrs]
-    if sigmas:
-        sigma = float(np.median(sigmas))
-        ax.axhspan(-sigma, sigma, color="0.5", alpha=0.2, label="thermal ±1σ")
+ERRORS = (
+    ("code_m", "code (m)", "code_sigma_m"),
+    ("phase_cycles", "phase (cycle)", "phase_sigma_cycles"),
+    ("doppler_hz", "Doppler (Hz)", None),
+    ("code_minus_carrier_m", "code − carrier (m)", None),
+)
+"""Column of the tracking errors, its label, and the attribute of the epochs that holds its thermal sigma."""
+
+
+def _one_error(
+    row: Any, key: str, theory: str | None, with_truth: dict[str, Any], channels: dict[str, h5py.Group]
+) -> None:
+    """One kind of error: over time in the left axes, rms and thermal sigma of each satellite in the right."""
+    spans = []
+    for k, (name, errors) in enumerate(with_truth.items()):
+        attrs, label = channels[name]["epochs"].attrs, _label(channels[name])
+        settled = errors["t_s"] > errors["t_s"][:1] + 2.0
+        values = errors[key][settled]
+        row[0].plot(errors["t_s"][settled], values, lw=0.5, alpha=0.6, color=f"C{k}")
+        if not len(values):
+            continue
+        spans.append(values)
+        first = not k
+        row[1].plot(
+            label, np.sqrt(np.mean(values**2)), "o", color=f"C{k}", label="measured" if first else None
+        )
+        if theory and theory in attrs:
+            row[1].plot(label, attrs[theory], "k_", ms=12, label="thermal σ" if first else None)
+    limit = 1.3 * float(np.quantile(np.abs(np.concatenate(spans)), 0.999)) if spans else 1.0
+    row[0].set_ylim(-limit or -1, limit or 1)
+    row[1].set_ylim(bottom=0)
 
 
 def _cn0(h5: h5py.File, channels: dict[str, h5py.Group], directory: Path) -> Path | None:
