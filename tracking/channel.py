@@ -208,9 +208,9 @@ class Tracker:
         self._hist = np.zeros((0, HISTORY, 2))
         self._commands = np.zeros(0, AIDING)
         self._pool, self._tables = np.zeros(0, np.int8), {}
-        self._buffer, self._first, self._end, self._begun = np.zeros((2, 0), np.int8), 0, 0, False
+        self._tail, self._end, self._begun = np.zeros((2, 0), np.int8), 0, False
         self._secondary = np.asarray(secondary_code(), np.float64)
-        self._threads = ThreadPoolExecutor(spec.threads) if spec.threads > 1 else None
+        self._threads = ThreadPoolExecutor(spec.threads - 1) if spec.threads > 1 else None
 
     # ------------------------------------------------------------------------------------------- channels
     def add(self, acquisition):
@@ -436,49 +436,38 @@ class Tracker:
         corr : complex64 (C, n_max, K)
             Correlator outputs of those integrations at ``taps_chips(c)``; unused columns are zero.
         """
-        self._append(int(n0), iq)
+        self._check(int(n0), iq)
         if aiding is not None:
             if len(aiding) != len(self.channels):
                 raise ValueError(
                     f"aiding has {len(aiding)} rows for {len(self.channels)} channels: give one each"
                 )
             self._commands[:] = aiding
-        n = self._end - self._first
-        shortest = float(np.min(self.channels["period_s"], initial=4e-3))
-        n_max = int(n / (self.fs_hz * shortest) * 1.01) + 2
-        shape = (len(self.channels), n_max)
-        epochs, corr = np.zeros(shape, EPOCH), np.zeros((*shape, self._tap_q.shape[1] - 2), np.complex64)
-        counts = np.zeros(shape[0], np.int64)
-        self.symbols = np.zeros((shape[0], n_max + HISTORY // 4), SYMBOL)
-        self.symbol_counts = np.zeros(shape[0], np.int64)
-        active = self._running()
-
-        integer = int(HAS_INTEGER_PATH and self._buffer.dtype == np.int8 and self.spec.arithmetic == "auto")
+        # What was left over grows by the first code periods of the slab: no channel needs to cross the seam after them.
+        tail = np.concatenate([self._tail, iq[:, : self._head_samples()]], axis=1)
+        first, n_left = self._end - self._tail.shape[1], self._tail.shape[1]
+        self._end += iq.shape[1]
+        n_channels, n_max = len(self.channels), self._most_periods(self._end - first)
+        epochs = np.zeros((n_channels, n_max), EPOCH)
+        corr = np.zeros((n_channels, n_max, self._tap_q.shape[1] - 2), np.complex64)
+        counts, self.symbol_counts = np.zeros(n_channels, np.int64), np.zeros(n_channels, np.int64)
+        self.symbols = np.zeros((n_channels, n_max + HISTORY // 4), SYMBOL)
+        integer = int(HAS_INTEGER_PATH and iq.dtype == np.int8 and self.spec.arithmetic == "auto")
 
         def run(which):
-            track_slab(
-                which, integer, self._buffer[0], self._buffer[1], self._first, n, self.fs_hz, self.if_hz, self._pool,
-                self._tap_q, self._secondary, self.channels, self._acc, self._hist, self._commands, epochs, counts,
-                corr, self.symbols, self.symbol_counts,
-            )  # fmt: skip
+            for begin, samples in ((first, tail), (first + n_left, iq)):
+                track_slab(
+                    which, integer, samples[0], samples[1], begin, self.fs_hz, self.if_hz, self._pool, self._tap_q,
+                    self._secondary, self.channels, self._acc, self._hist, self._commands, epochs, counts, corr,
+                    self.symbols, self.symbol_counts,
+                )  # fmt: skip
 
-        if len(active) == 0:
-            pass
-        elif self._threads is None or len(active) == 1:
-            run(active)
-        else:
-            parts = [active[t :: self.spec.threads] for t in range(min(self.spec.threads, len(active)))]
-            list(self._threads.map(run, parts))
-        self._keep_tail()
+        self._share(run, self._running())
+        self._keep(tail[:, :n_left], iq)
         return epochs, counts, corr
 
-    def _running(self):
-        """Indices of channels that take samples."""
-        state = self.channels["state"]
-        return np.flatnonzero((state != STATE_IDLE) & (state != STATE_LOST))
-
-    def _append(self, n0, iq):
-        """Put the slab behind the samples that are left over."""
+    def _check(self, n0, iq):
+        """Raise ValueError unless the slab continues the samples before it."""
         if iq.ndim != 2 or iq.shape[0] != 2 or iq.dtype not in (np.int8, np.int16, np.float32):
             raise ValueError(
                 f"a slab is a (2, n) array of int8, int16 or float32, not {iq.dtype} of shape {iq.shape}"
@@ -487,26 +476,43 @@ class Tracker:
             raise ValueError(
                 f"slab starts at sample {n0} where {self._end} was expected: slabs must not leave gaps"
             )
+        if self._tail.size and self._tail.dtype != iq.dtype:
+            raise ValueError(f"slab is {iq.dtype} after {self._tail.dtype}: keep one sample type")
         if not self._begun:
-            self._first, self._end, self._begun = n0, n0, True
-        left, n = self._end - self._first, iq.shape[1]
-        if self._buffer.dtype != iq.dtype or self._buffer.shape[1] < left + n:
-            fresh = np.zeros((2, left + n + int(0.01 * self.fs_hz)), iq.dtype)
-            if left:
-                if self._buffer.dtype != iq.dtype:
-                    raise ValueError(f"slab is {iq.dtype} after {self._buffer.dtype}: keep one sample type")
-                fresh[:, :left] = self._buffer[:, :left]
-            self._buffer = fresh
-        self._buffer[:, left : left + n] = iq
-        self._end += n
+            self._end, self._begun = n0, True
+        if not self._tail.size:
+            self._tail = np.zeros((2, 0), iq.dtype)
 
-    def _keep_tail(self):
-        """Move the samples that some channel still needs to the front."""
-        needed = int(np.min(self.channels["next_sample"][self._running()], initial=self._end))
-        left = self._end - needed
-        start = needed - self._first
-        self._buffer[:, :left] = self._buffer[:, start : start + left].copy()
-        self._first = needed
+    def _head_samples(self):
+        """Two of the longest code periods: a period that steering stretches is at most one and a half."""
+        return math.ceil(2.01 * self.fs_hz * float(np.max(self.channels["period_s"], initial=0.0)))
+
+    def _most_periods(self, n):
+        shortest = float(np.min(self.channels["period_s"], initial=4e-3))
+        return int(n / (self.fs_hz * shortest) * 1.01) + 2
+
+    def _running(self):
+        """Indices of channels that take samples."""
+        state = self.channels["state"]
+        return np.flatnonzero((state != STATE_IDLE) & (state != STATE_LOST))
+
+    def _share(self, run, active):
+        """Run the channels, each on one thread."""
+        n = min(self.spec.threads, len(active))
+        if n == 0:
+            return
+        others = [self._threads.submit(run, active[t::n]) for t in range(1, n)]
+        run(active[::n])
+        for other in others:
+            other.result()
+
+    def _keep(self, left, iq):
+        """Keep the samples that some channel still needs: of those ``left`` over before the slab, and of the slab."""
+        needed = self._end - int(np.min(self.channels["next_sample"][self._running()], initial=self._end))
+        if needed <= iq.shape[1]:
+            self._tail = iq[:, iq.shape[1] - needed :].copy()
+        else:
+            self._tail = np.concatenate([left[:, left.shape[1] + iq.shape[1] - needed :], iq], axis=1)
 
     def snapshot(self, sample_index):
         """Replicas of all channels at one receiver sample -> REPLICA (C,).

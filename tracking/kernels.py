@@ -19,6 +19,7 @@ import numpy as np
 from numba import njit
 
 from signals.constants import CHIP_RATE_HZ, F_L1_HZ
+from tracking.correlator import carrier_table, correlate_period, scratch
 from tracking.discriminators import (
     COHERENT,
     FOUR_QUADRANT,
@@ -35,18 +36,6 @@ from tracking.lock import (
     cn0_moments_dbhz,
     cn0_noise_reference_dbhz,
     code_lock,
-)
-from tracking.vector_ir import (
-    HAS_INTEGER_PATH,
-    INTEGER_SCALE,
-    TABLE_ONE,
-    WIDTH,
-    dot3,
-    dot4,
-    dot5,
-    dot6,
-    fused4,
-    wipe,
 )
 
 __all__ = ["CHANNEL", "HISTORY", "SYMBOL", "track_slab"]
@@ -191,265 +180,8 @@ CHANNEL = np.dtype(
 )
 """One channel: what is constant, its NCOs, filters, smoothed moments and lock state."""
 
-_BLOCK = 1024
-_FAST = {"reassoc", "contract", "nsz", "arcp"}
 _TWO_PI = 2.0 * math.pi
-_F = np.float32
-_U = np.uint64
-
-
-# ------------------------------------------------------------------------------------------------- correlator
-@njit(fastmath=_FAST, nogil=True)
-def _fused4(xi, xq, a, n, ct, sn, pool, s0, s1, s2, s3, out):
-    """Wipe off the carrier and correlate four taps in one pass."""
-    a0 = a1 = a2 = a3 = b0 = b1 = b2 = b3 = _F(0.0)
-    for j in range(n):
-        x, y, c, s = _F(xi[a + j]), _F(xq[a + j]), ct[j], sn[j]
-        u = x * c + y * s
-        v = y * c - x * s
-        p = _F(pool[s0 + j])
-        a0 += p * u
-        b0 += p * v
-        p = _F(pool[s1 + j])
-        a1 += p * u
-        b1 += p * v
-        p = _F(pool[s2 + j])
-        a2 += p * u
-        b2 += p * v
-        p = _F(pool[s3 + j])
-        a3 += p * u
-        b3 += p * v
-    out[0], out[1], out[2], out[3], out[4], out[5], out[6], out[7] = a0, b0, a1, b1, a2, b2, a3, b3
-
-
-@njit(fastmath=_FAST, nogil=True)
-def _fused7(xi, xq, a, n, ct, sn, pool, s0, s1, s2, s3, s4, s5, s6, out):
-    """As ``_fused4`` with seven taps."""
-    a0 = a1 = a2 = a3 = a4 = a5 = a6 = b0 = b1 = b2 = b3 = b4 = b5 = b6 = _F(0.0)
-    for j in range(n):
-        x, y, c, s = _F(xi[a + j]), _F(xq[a + j]), ct[j], sn[j]
-        u = x * c + y * s
-        v = y * c - x * s
-        p = _F(pool[s0 + j])
-        a0 += p * u
-        b0 += p * v
-        p = _F(pool[s1 + j])
-        a1 += p * u
-        b1 += p * v
-        p = _F(pool[s2 + j])
-        a2 += p * u
-        b2 += p * v
-        p = _F(pool[s3 + j])
-        a3 += p * u
-        b3 += p * v
-        p = _F(pool[s4 + j])
-        a4 += p * u
-        b4 += p * v
-        p = _F(pool[s5 + j])
-        a5 += p * u
-        b5 += p * v
-        p = _F(pool[s6 + j])
-        a6 += p * u
-        b6 += p * v
-    out[0], out[1], out[2], out[3], out[4], out[5], out[6] = a0, b0, a1, b1, a2, b2, a3
-    out[7], out[8], out[9], out[10], out[11], out[12], out[13] = b3, a4, b4, a5, b5, a6, b6
-
-
-@njit(fastmath=_FAST, nogil=True)
-def _wipe(xi, xq, a, n, ct, sn, wi, wq):
-    for j in range(n):
-        x, y, c, s = _F(xi[a + j]), _F(xq[a + j]), ct[j], sn[j]
-        wi[j] = x * c + y * s
-        wq[j] = y * c - x * s
-
-
-@njit(fastmath=_FAST, nogil=True)
-def _dot4(wi, wq, n, pool, s0, s1, s2, s3, out, o):
-    a0 = a1 = a2 = a3 = b0 = b1 = b2 = b3 = _F(0.0)
-    for j in range(n):
-        u, v = wi[j], wq[j]
-        p = _F(pool[s0 + j])
-        a0 += p * u
-        b0 += p * v
-        p = _F(pool[s1 + j])
-        a1 += p * u
-        b1 += p * v
-        p = _F(pool[s2 + j])
-        a2 += p * u
-        b2 += p * v
-        p = _F(pool[s3 + j])
-        a3 += p * u
-        b3 += p * v
-    out[o], out[o + 1], out[o + 2], out[o + 3] = a0, b0, a1, b1
-    out[o + 4], out[o + 5], out[o + 6], out[o + 7] = a2, b2, a3, b3
-
-
-@njit(nogil=True)
-def _float_block(xi, xq, a, n, ct, sn, pool, starts, n_sums, wi, wq, out):
-    """All sums of one block into ``out`` (I, Q interleaved); ``starts`` is padded."""
-    if n_sums <= 4:
-        _fused4(xi, xq, a, n, ct, sn, pool, starts[0], starts[1], starts[2], starts[3], out)
-    elif n_sums <= 7:
-        _fused7(
-            xi, xq, a, n, ct, sn, pool,
-            starts[0], starts[1], starts[2], starts[3], starts[4], starts[5], starts[6], out,
-        )  # fmt: skip
-    else:
-        _wipe(xi, xq, a, n, ct, sn, wi, wq)
-        for t in range(0, n_sums, 4):
-            _dot4(wi, wq, n, pool, starts[t], starts[t + 1], starts[t + 2], starts[t + 3], out, 2 * t)
-
-
-if HAS_INTEGER_PATH:
-
-    @njit(nogil=True)
-    def _integer_block(x, y, c, s, table, starts, steps, n_sums, u, v, to):
-        """int32 sums of 16 ``steps`` samples (``vector_ir``); all arguments but the counts are addresses."""
-        if n_sums <= 4:
-            fused4(x, y, c, s, table, starts, steps, to)
-            return
-        wipe(x, y, c, s, steps, u, v)
-        left = n_sums
-        while left > 0:
-            if left > 10 or left == 6:
-                dot6(u, v, table, starts, steps, to)
-                k = 6
-            elif left == 5 or left > 8:
-                dot5(u, v, table, starts, steps, to)
-                k = 5
-            elif left == 4 or left > 6:
-                dot4(u, v, table, starts, steps, to)
-                k = 4
-            else:
-                dot3(u, v, table, starts, steps, to)
-                k = 3
-            starts, to, left = starts + 8 * k, to + 8 * k, left - k
-
-else:
-
-    @njit(nogil=True)
-    def _integer_block(x, y, c, s, table, starts, steps, n_sums, u, v, to):
-        pass
-
-
-@njit(nogil=True)
-def _remainder(xi, xq, a, n, done, carrier, pool, starts, n_sums, work, out):
-    """Add the last samples of a block, fewer than the integer loops' step, in single precision."""
-    ct, sn, _, _ = carrier
-    wi, wq, _, rest = work
-    for t in range(n_sums):
-        starts[t] += _U(done)
-    _float_block(
-        xi, xq, _U(a + done), _U(n - done), ct[done:], sn[done:], pool, starts, n_sums, wi, wq, rest
-    )  # fmt: skip
-    for k in range(2 * n_sums):
-        out[k] += rest[k]
-
-
-@njit(nogil=True)
-def _carrier_table(step_cycles, carrier):
-    """exp(2 pi i step j), j < 1024, as 32 x 32 products of rotations built in double precision."""
-    ct, sn, ci, si = carrier
-    bc, bs = np.empty(32, np.float32), np.empty(32, np.float32)
-    c1, s1 = math.cos(_TWO_PI * step_cycles), math.sin(_TWO_PI * step_cycles)
-    c, s = 1.0, 0.0
-    for j in range(32):
-        bc[j], bs[j] = c, s
-        c, s = c * c1 - s * s1, c * s1 + s * c1
-    c32, s32 = c, s
-    c, s = 1.0, 0.0
-    for m in range(32):
-        fc, fs = _F(c), _F(s)
-        for j in range(32):
-            ct[32 * m + j] = bc[j] * fc - bs[j] * fs
-            sn[32 * m + j] = bc[j] * fs + bs[j] * fc
-        c, s = c * c32 - s * s32, c * s32 + s * c32
-    for j in range(_BLOCK):
-        ci[j] = np.int16(math.floor(ct[j] * _F(TABLE_ONE) + _F(0.5)))
-        si[j] = np.int16(math.floor(sn[j] * _F(TABLE_ONE) + _F(0.5)))
-
-
-@njit(nogil=True)
-def _place_taps(st, q0, tap_q, starts):
-    """Where each tap's code values of a block start in the pool, for a replica phase of ``q0`` in 1/P samples.
-
-    Returns by how much E and L are off on average because the period is no whole number of 1/P samples, in 1/P samples.
-    """
-    n_sums, shift, mask = st.n_sums, st.phase_shift, st.n_phase - 1
-    wrap, columns, start = st.wrap_q, st.table_columns, st.table_start
-    q0 %= wrap
-    for t in range(n_sums):
-        q = q0 + tap_q[t]
-        if q < 0:
-            q += wrap
-        elif q >= wrap:
-            q -= wrap
-        starts[t] = _U(start + (q & mask) * columns + (q >> shift))
-    if n_sums > st.n_taps + 1:
-        starts[n_sums - 1] += _U(st.data_table_start - start)
-    if st.wrap_error_q == 0.0:
-        return 0.0
-    wraps = 0.0
-    for t in (st.early, st.late):
-        wraps += 1.0 if q0 + tap_q[t] < 0 else 0.0
-        wraps -= 1.0 if q0 + tap_q[t] >= wrap else 0.0
-    return 0.5 * wraps * st.wrap_error_q
-
-
-@njit(nogil=True)
-def _correlate_period(
-    st, integer, xi, xq, a0, n, theta, step, rate, carrier, pool, tap_q, starts, work, out, sums
-):
-    """One code period: ``sums`` (n_sums + 1 complex as pairs; the last is the prompt's second half).
-
-    theta, step: carrier phase at the first sample and its advance per sample, cycles. Returns the sum over samples of
-    (replica's phase - nominal phase), chips, at the mean of E and L.
-    """
-    n_sums, prompt, n_phase, per_chip, phase = (
-        st.n_sums, st.prompt, st.n_phase, st.samples_per_chip, st.code_phase_chips,
-    )  # fmt: skip
-    ct, sn, ci, si = carrier
-    wi, wq, whole, _ = work
-    x, y = xi.ctypes.data + a0, xq.ctypes.data + a0
-    c_at, s_at, table, starts_at, to = (
-        ci.ctypes.data, si.ctypes.data, pool.ctypes.data, starts.ctypes.data, whole.ctypes.data,
-    )  # fmt: skip
-    u, v = wi.ctypes.data, wq.ctypes.data
-    longest = st.longest_block
-    blocks = 2 * ((n + 2 * longest - 1) // (2 * longest))
-    block = min(longest, ((n + blocks - 1) // blocks + 31) // 32 * 32)
-    n_blocks = (n + block - 1) // block
-    for k in range(2 * n_sums + 2):
-        sums[k] = 0.0
-    c, s = math.cos(_TWO_PI * theta), math.sin(_TWO_PI * theta)
-    dc, ds = math.cos(_TWO_PI * step * block), math.sin(_TWO_PI * step * block)
-    rounding = 0.0
-    for b in range(n_blocks):
-        a = b * block
-        nb = min(block, n - a)
-        middle = phase + (a + 0.5 * nb) * rate
-        q0 = math.floor((middle * per_chip - 0.5 * nb) * n_phase + 0.5)
-        wraps = _place_taps(st, np.int64(q0), tap_q, starts)
-        rounding += (((q0 + wraps) / n_phase + 0.5 * nb) / per_chip - middle) * nb
-        if integer:
-            steps = nb // WIDTH
-            _integer_block(x + a, y + a, c_at, s_at, table, starts_at, steps, n_sums, u, v, to)
-            for k in range(2 * n_sums):
-                out[k] = _F(whole[k]) * _F(1.0 / INTEGER_SCALE)
-            if steps * WIDTH < nb:
-                _remainder(xi, xq, a0 + a, nb, steps * WIDTH, carrier, pool, starts, n_sums, work, out)
-        else:
-            _float_block(xi, xq, _U(a0 + a), _U(nb), ct, sn, pool, starts, n_sums, wi, wq, out)
-        for t in range(n_sums):
-            re, im = np.float64(out[2 * t]), np.float64(out[2 * t + 1])
-            sums[2 * t] += re * c + im * s
-            sums[2 * t + 1] += im * c - re * s
-        if 2 * b >= n_blocks:
-            re, im = np.float64(out[2 * prompt]), np.float64(out[2 * prompt + 1])
-            sums[2 * n_sums] += re * c + im * s
-            sums[2 * n_sums + 1] += im * c - re * s
-        c, s = c * dc - s * ds, c * ds + s * dc
-    return rounding
+_TILE_BYTES = 1 << 18  # of I and Q together: a few of them fit the second-level cache
 
 
 # -------------------------------------------------------------------------------------------- synchronisation
@@ -1130,10 +862,61 @@ def _accumulate(st, acc, sums, n, sign):
         st.second_q += sign * sums[2 * st.prompt + 1]
 
 
+@njit(nogil=True, error_model="numpy")
+def _run_channel(st, until, integer, xi, xq, first, fs_hz, if_hz, pool, tap_q, secondary, acc, hist, command,
+                 epochs, k, corr, symbols, n_symbols, work, sums):  # fmt: skip
+    """Take one channel through the code periods that begin before sample ``until`` -> (epochs, symbols) filled."""
+    end = first + len(xi)
+    if_step = if_hz / fs_hz
+    table_hz = math.nan
+    work[3][:] = np.uint64(st.table_start)
+    while STATE_PULL_IN <= st.state <= STATE_LOCKED and first <= st.next_sample < until and k < len(epochs):
+        if st.m_done == 0 and st.n_acc == 0:
+            _begin(st, command, fs_hz)
+            acc[:] = 0.0
+        rough = st.doppler_hz
+        if st.doppler_rate_hz_s != 0.0:
+            rough += st.doppler_rate_hz_s * ((st.next_sample - st.start_sample) / fs_hz + 0.5 * st.period_s)
+        rate = (CHIP_RATE_HZ * (1.0 + rough / F_L1_HZ) + st.code_rate_chips_s) / fs_hz
+        n = np.int64(math.ceil((st.code_length_chips - st.code_phase_chips) / rate))
+        if st.next_sample + n > end:
+            break
+        if rough != table_hz:
+            carrier_table((if_hz + rough) / fs_hz, work[0], work[1])
+            table_hz = rough
+        turns = if_step * st.next_sample
+        theta = turns - math.floor(turns) + st.carrier_cycles
+        theta -= math.floor(theta)
+        sign = 1.0
+        if st.kind == KIND_PILOT and st.state == STATE_LOCKED:
+            sign = secondary[(st.code_period + st.symbol_phase) % 25]
+        st.rounding_sum += correlate_period(
+            st, integer, xi, xq, st.next_sample - first, n, theta, (if_hz + rough) / fs_hz, rate, pool, tap_q, work,
+            sums,
+        )  # fmt: skip
+        _accumulate(st, acc, sums, n, sign)
+        n_symbols = _symbols(st, sums, n, st.next_sample, symbols, n_symbols)
+        st.m_done += 1
+        st.n_acc += n
+        st.next_sample += n
+        st.code_period += 1
+        st.code_phase_chips += n * rate - st.code_length_chips
+        st.carrier_cycles += rough * n / fs_hz
+        if st.m_done >= st.m_total:
+            if st.doppler_rate_hz_s != 0.0:
+                st.doppler_hz += st.doppler_rate_hz_s * st.n_acc / fs_hz
+            n_symbols = _finish(st, acc, hist, secondary, fs_hz, epochs[k], corr[k], symbols, n_symbols)
+            st.m_done, st.n_acc = 0, 0
+            k += 1
+    return k, n_symbols
+
+
 @njit(cache=True, nogil=True)
-def track_slab(which, integer, xi, xq, first, n_avail, fs_hz, if_hz, pool, tap_q, secondary, ch, acc, hist,
+def track_slab(which, integer, xi, xq, first, fs_hz, if_hz, pool, tap_q, secondary, ch, acc, hist,
                commands, epochs, counts, corr, symbols, symbol_counts):  # fmt: skip
-    """Take the channels ``which`` through every whole code period of the samples.
+    """Take the channels ``which`` through every whole code period that begins within the samples.
+
+    Channels take turns in tiles that stay in the cache.
 
     Parameters
     ----------
@@ -1141,8 +924,8 @@ def track_slab(which, integer, xi, xq, first, n_avail, fs_hz, if_hz, pool, tap_q
         Channels to run.
     integer : int
         1: 16-bit integer loops (int8 samples where ``vector_ir.HAS_INTEGER_PATH``); 0: single precision.
-    xi, xq : int8 | int16 | float32 (>= n_avail,)
-        Samples ``first`` .. ``first + n_avail - 1``.
+    xi, xq : int8 | int16 | float32 (n,)
+        Samples from ``first`` on.
     pool : int8 (n,)
         All code tables, row after row.
     tap_q : int64 (C, K + 2)
@@ -1153,71 +936,15 @@ def track_slab(which, integer, xi, xq, first, n_avail, fs_hz, if_hz, pool, tap_q
         State, changed in place; with ``acc`` float64 (C, 2 K + 4) and ``hist`` float64 (C, HISTORY, 2).
     commands : AIDING (C,)
     epochs : EPOCH (C, n_max); corr : complex64 (C, n_max, K); symbols : SYMBOL (C, n_max + HISTORY / 4)
-        Outputs; ``counts`` and ``symbol_counts`` int64 (C,) say how many rows are filled.
+        Outputs; ``counts`` and ``symbol_counts`` int64 (C,) say how many rows are filled, before and after.
     """
-    n_columns = tap_q.shape[1]
-    carrier = (
-        np.empty(_BLOCK, np.float32), np.empty(_BLOCK, np.float32),
-        np.empty(_BLOCK, np.int16), np.empty(_BLOCK, np.int16),
-    )  # fmt: skip
-    wide = 2 * n_columns + 16
-    work = (
-        np.empty(_BLOCK, np.float32), np.empty(_BLOCK, np.float32),
-        np.zeros(wide, np.int32), np.zeros(wide, np.float32),
-    )  # fmt: skip
-    starts = np.zeros(n_columns + 8, np.uint64)
-    out = np.zeros(wide, np.float32)
-    sums = np.zeros(2 * n_columns + 4)
-    end = first + n_avail
-    if_step = if_hz / fs_hz
-    for c in which:
-        st = ch[c]
-        k, n_symbols = 0, 0
-        table_hz = math.nan
-        starts[:] = _U(st.table_start)
-        while STATE_PULL_IN <= st.state <= STATE_LOCKED and k < epochs.shape[1]:
-            if st.m_done == 0:
-                if st.n_acc == 0:
-                    _begin(st, commands[c], fs_hz)
-                    acc[c, :] = 0.0
-            rough = st.doppler_hz
-            if st.doppler_rate_hz_s != 0.0:
-                rough += st.doppler_rate_hz_s * (
-                    (st.next_sample - st.start_sample) / fs_hz + 0.5 * st.period_s
-                )
-            rate = (CHIP_RATE_HZ * (1.0 + rough / F_L1_HZ) + st.code_rate_chips_s) / fs_hz
-            n = np.int64(math.ceil((st.code_length_chips - st.code_phase_chips) / rate))
-            if st.next_sample + n > end:
-                break
-            if rough != table_hz:
-                _carrier_table((if_hz + rough) / fs_hz, carrier)
-                table_hz = rough
-            turns = if_step * st.next_sample
-            theta = turns - math.floor(turns) + st.carrier_cycles
-            theta -= math.floor(theta)
-            sign = 1.0
-            if st.kind == KIND_PILOT and st.state == STATE_LOCKED:
-                sign = secondary[(st.code_period + st.symbol_phase) % 25]
-            rounding = _correlate_period(
-                st, integer, xi, xq, st.next_sample - first, n, theta, (if_hz + rough) / fs_hz, rate, carrier, pool,
-                tap_q[c], starts, work, out, sums,
+    work = scratch(tap_q.shape[1])
+    sums = np.zeros(2 * tap_q.shape[1] + 4)
+    tile = _TILE_BYTES // (2 * xi.itemsize)
+    for begin in range(first, first + len(xi), tile):
+        for c in which:
+            counts[c], symbol_counts[c] = _run_channel(
+                ch[c], begin + tile, integer, xi, xq, first, fs_hz, if_hz, pool,
+                tap_q[c], secondary, acc[c], hist[c], commands[c], epochs[c], counts[c], corr[c], symbols[c],
+                symbol_counts[c], work, sums,
             )  # fmt: skip
-            st.rounding_sum += rounding
-            _accumulate(st, acc[c], sums, n, sign)
-            n_symbols = _symbols(st, sums, n, st.next_sample, symbols[c], n_symbols)
-            st.m_done += 1
-            st.n_acc += n
-            st.next_sample += n
-            st.code_period += 1
-            st.code_phase_chips += n * rate - st.code_length_chips
-            st.carrier_cycles += rough * n / fs_hz
-            if st.m_done >= st.m_total:
-                if st.doppler_rate_hz_s != 0.0:
-                    st.doppler_hz += st.doppler_rate_hz_s * st.n_acc / fs_hz
-                n_symbols = _finish(
-                    st, acc[c], hist[c], secondary, fs_hz, epochs[c, k], corr[c, k], symbols[c], n_symbols
-                )
-                st.m_done, st.n_acc = 0, 0
-                k += 1
-        counts[c] = k
-        symbol_counts[c] = n_symbols
