@@ -15,6 +15,7 @@ which needs a stable phi (I - K H): it is not, see ``frozen``. The measurement n
 outputs, one per integration, not smoothed pseudoranges.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -410,16 +411,22 @@ class AlsRun:
         self.unavailable: str | None = None
         self._seen = 0
 
-    def __call__(self, filt: Eskf, respond: bool = True, epochs: int = 1) -> AlsResult | None:
-        """Look at the filter's log, ``epochs`` longer than at the last call; without ``respond`` it is only read."""
-        need = self.spec.settle_epochs + self.spec.window_epochs
+    def __call__(self, filt: Eskf, respond: bool = True) -> AlsResult | None:
+        """Look at the filter's log; with ``respond=False`` the filter is only read, never touched."""
+        result = self.look(filt.log)
+        if result is not None and respond and self.spec.retune_p:
+            filt.reset(result.covariance)
+        return result
+
+    def look(self, take: Callable[[int], EpochLog], epochs: int = 1) -> AlsResult | None:
+        """The same on any log that is ``epochs`` longer than at the last call; ``take(n)`` gives its last n."""
+        spec, need = self.spec, self.spec.settle_epochs + self.spec.window_epochs
         self._seen += epochs
         if self._seen < need:
             return None
         self._seen = 0
-        spec = self.spec
         try:
-            log = filt.log(need)
+            log = take(need)
             self.result = estimate(
                 log,
                 _often_used(log, self.rows),
@@ -432,6 +439,4 @@ class AlsRun:
             self.unavailable = str(error)
             return None
         self.unavailable = None
-        if respond and spec.retune_p:
-            filt.reset(self.result.covariance)
         return self.result

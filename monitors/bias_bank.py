@@ -335,6 +335,17 @@ class BiasBankRun:
         self._count += 1
         return self._report()
 
+    def grown(self, m: int) -> "BiasBankRun":
+        """A bank for ``m`` satellite slots, the first of which carry on as here."""
+        run = self.spec.start(m)
+        run.log_p[: self.log_p.size] = self.log_p
+        # A newcomer's hypotheses begin where any other improbable one stands.
+        run.log_p[self.log_p.size :] = math.log(self.spec.floor)
+        run._chi2[:, : self.log_p.size] = self._chi2
+        run._chi2[:, self.log_p.size :] = self._chi2[:, :1]
+        run._dof[:], run._count = self._dof, self._count
+        return run
+
     def _report(self) -> BiasReport:
         held = min(self._count, self.spec.fit_epochs)
         best = int(np.argmax(self.log_p))

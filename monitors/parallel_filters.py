@@ -489,6 +489,10 @@ class PacedBank:
         self._phi, self._qd = np.eye(dx.size), np.zeros((dx.size, dx.size))
         return report
 
+    def moved(self, dx: np.ndarray) -> None:
+        """Somebody else corrected the filter's trajectory by dx."""
+        self._moved += dx
+
     def takeover(self) -> np.ndarray:
         """dx (n,) that brings the filter to the bank's navigation filter; the bank's states move along."""
         correction = self.bank.x[0].copy()

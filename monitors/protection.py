@@ -163,7 +163,7 @@ def chi2_limit(dof: int, p: float) -> float:
     return float(chdtri(dof, p))
 
 
-STEP = 1.03
+SLOPE_STEP = 1.03
 """Slopes are rounded up to this ratio, so that a level is computed once and not every epoch."""
 
 
@@ -178,11 +178,11 @@ def _missed(threshold: float, dof: int) -> tuple[np.ndarray, np.ndarray]:
 
 @lru_cache(maxsize=4096)
 def _unit_level(vertical: bool, k: int, allowed: float, threshold: float, dof: int) -> float:
-    """Level of unit sigma for the slope STEP^k per unit of sqrt(non-centrality); as ``_level``, to 1e-4."""
+    """Level of unit sigma for the slope SLOPE_STEP^k per unit of sqrt(non-centrality); as ``_level``, to 1e-4."""
     from scipy.special import chndtr, ndtr, ndtri
 
     bias, missed = _missed(threshold, dof)
-    shift = STEP**k * bias
+    shift = SLOPE_STEP**k * bias
     low, high = 0.0, float(shift[-1]) + 4.0 - float(ndtri(min(allowed, 0.5) / 4))
     while high - low > 1e-4 * high:
         middle = 0.5 * (low + high)
@@ -195,7 +195,7 @@ def _unit_level(vertical: bool, k: int, allowed: float, threshold: float, dof: i
 
 
 def quick_levels(h_enu: np.ndarray, var: np.ndarray, spec: Protection) -> tuple[float, float]:
-    """(HPL, VPL) as ``protection_levels``, at most ``STEP`` larger, from a table that fills itself.
+    """(HPL, VPL) as ``protection_levels``, at most ``SLOPE_STEP`` larger, from a table that fills itself.
 
     With b' = b sqrt(P_ii) the risk of satellite i depends on its slope S_i / sqrt(P_ii) over sigma alone.
     """
@@ -214,7 +214,7 @@ def quick_levels(h_enu: np.ndarray, var: np.ndarray, spec: Protection) -> tuple[
             if parity[i, i] * sigma**2 <= 1e-9:
                 return math.inf, math.inf
             slope = max(size[i] / (sigma * math.sqrt(parity[i, i])), 1e-3)
-            k = math.ceil(math.log(slope) / math.log(STEP))
+            k = math.ceil(math.log(slope) / math.log(SLOPE_STEP))
             found = max(found, sigma * _unit_level(vertical, k, allowed, threshold, dof))
         levels_m.append(found)
     return levels_m[0], levels_m[1]

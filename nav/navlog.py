@@ -121,6 +121,11 @@ class NavigatorLog:
         self.count += 1
         self._phi[:], self._qd[:] = np.eye(dx.size), 0.0
 
+    def last(self) -> EpochLog:
+        """The last epoch (views)."""
+        i = (self.count - 1) % self.length
+        return EpochLog(*(array[i] for array in self._ring))
+
     def log(self, n_epochs: int | None = None) -> EpochLog:
         """The last ``n_epochs`` epochs, oldest first (copies)."""
         have = min(self.count, self.length)

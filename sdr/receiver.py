@@ -92,7 +92,7 @@ class Receiver:
         self.flags = Flags(respond.weaken, respond.weaken_by, respond.hold_s, self.fs_hz)
         self.integrity = spec.integrity.start(spec.respond, self.fs_hz) if spec.integrity else None
         if self.integrity is not None:
-            self.integrity.watch(self.navigator)
+            self.integrity.watch(self.navigator, self.steering)
         self.channel_of: dict[tuple[str, int], int] = {}
         self.searched: dict[str, list[int]] = {}
         self._search_spec = spec.acquisition
@@ -247,7 +247,7 @@ class Receiver:
             out.solutions.append(np.atleast_1d(np.asarray(solution, SOLUTION)))
         if self.integrity is not None:
             # What it asks for holds from the next epoch on: the hand-over to navigation, one epoch later.
-            out.integrity.append(self.integrity(self.navigator, sample))
+            out.integrity.append(self.integrity(sample))
 
     def _remedy(self, sample: int) -> Remedy | None:
         """What the monitors ask of the epoch that ends at ``sample``; None unless ``[receiver.respond]`` wants it."""
@@ -322,13 +322,15 @@ class Receiver:
     def _steer(self, sample: int, epochs: np.ndarray, counts: np.ndarray, out: Outcome) -> None:
         steering = self.steering
         assert steering is not None
-        remedy, snap = self._remedy(sample), self.navigator.snapshot
         if not self.spec.respond.off or self.flags.names:
-            steering.heed(remedy, {} if snap is None else dict(zip(snap.names, snap.own_m2)))
+            watched = None if self.integrity is None else self.integrity.steered
+            steering.heed(self._remedy(sample), {} if watched is None else watched.own_m2())
         self._aiding = steering.advance(
             sample, epochs, counts, self.tracker.channels["state"], self.telemetry.ephemerides
         )
         out.steering = steering.record.copy()
+        if self.integrity is not None:
+            self.integrity.gather(steering)
         if steering.filter is None:
             return
         if self._week is not None and steering.filter.epochs % SOLUTION_EVERY == 0:

@@ -252,8 +252,9 @@ def results_lines() -> Iterator[str]:
     import nav.records
     import sdr.campaign
     import sdr.farm
-    import sdr.integrity
+    import sdr.findings
     import sdr.modes
+    import sdr.respond
     import sdr.watch
     import signals.records
     import tracking.mitigation
@@ -275,9 +276,9 @@ def results_lines() -> Iterator[str]:
         ("monitors/<name>", sdr.watch, "MONITOR"),
         ("monitors/thresholds", sdr.watch, "WATCHED"),
         ("monitors/alarms", monitors.records, "ALARM"),
-        ("monitors/<integrity monitor>", sdr.integrity, "INTEGRITY"),
-        ("monitors/protection", sdr.integrity, "PROTECTION"),
-        ("monitors/response", sdr.integrity, "RESPONSE"),
+        ("monitors/<integrity monitor>", sdr.findings, "INTEGRITY"),
+        ("monitors/protection", sdr.findings, "PROTECTION"),
+        ("monitors/response", sdr.respond, "RESPONSE"),
         ("mitigation/tones", tracking.mitigation, "TONE"),
         ("modes/<mode>/track", sdr.modes, "TRACK"),
         ("trials (campaigns)", sdr.campaign, "TRIAL"),

@@ -19,7 +19,8 @@ from nav.navigator import NavigationSpec
 from nav.sensor_files import read_imu, read_odometer
 from nav.steering import Sensors
 from nav.ultratight import SteeringSpec
-from sdr.integrity import IntegritySpec, RespondSpec
+from sdr.integrity import IntegritySpec
+from sdr.respond import RespondSpec
 from sdr.watch import WatchSpec
 from signals.clock import ClockSpec
 from signals.faults import FaultSpec, faulty
@@ -65,7 +66,7 @@ class ReceiverSpec(BaseModel):
 
     @model_validator(mode="after")
     def _monitors(self) -> "ReceiverSpec":
-        self.respond.check(self.integrity)
+        self.respond.check(self.integrity, self.navigation.smoothing_window_s)
         names = [m.name for m in self.monitor]
         twice = sorted({n for n in names if names.count(n) > 1})
         if twice:

@@ -8,12 +8,14 @@ import pytest
 from naive_pvt import FS_HZ, ephemerides, make_sky, transmit
 from pydantic import ValidationError
 
-from monitors.protection import protection_levels
+from monitors.protection import SLOPE_STEP, protection_levels, quick_levels
 from nav.navigator import NavigationSpec
 from nav.navlog import REMEDY, Remedy
-from sdr import integrity as live
-from sdr.integrity import IntegritySpec, Limits, RespondSpec
+from sdr.integrity import IntegritySpec, Limits
+from sdr.respond import RespondSpec
 from sdr.scenario import ReceiverSpec
+from signals.constants import METRES_PER_CHIP
+from tracking.lock import STATE_LOCKED
 from tracking.records import EPOCH
 
 Z = 5.0
@@ -61,7 +63,7 @@ def fly(sky, navigation, monitors=None, respond=None, n=150, fault=None, sigma_m
         row = nav.update(observed, eph, sky.iono_utc, sky.iono_utc, remedy=run.remedy if run else None)
         solutions.append(np.array(row))
         if run is not None:
-            for name, part in run(nav, int(observed["sample_index"][0])).items():
+            for name, part in run(int(observed["sample_index"][0])).items():
                 rows.setdefault(name, []).append(part)
     solutions = np.array(solutions)
     error = solutions["pos_ecef_m"] - sky.receiver(solutions["t_s"])["pos_ecef_m"]
@@ -172,10 +174,10 @@ def test_redundant_measurements_tell_the_noise_of_a_first_order_loop():
     run = IntegritySpec(noise_rmd={"window": n - 1, "pairing": "two_channel"}).start(RespondSpec(), 1e6)
     epochs = np.zeros(n, EPOCH)
     epochs["sample_index"], epochs["n_samples"] = np.arange(n) * 20_000, 20_000
-    epochs["state"], epochs["code_error_chips"], epochs["cn0_dbhz"] = live.STATE_LOCKED, error, 60.0
+    epochs["state"], epochs["code_error_chips"], epochs["cn0_dbhz"] = STATE_LOCKED, error, 60.0
     spec = ReceiverSpec(tracking={"l1ca": {"dll_bw_hz": bt_hz}})
     run.hear("G01", epochs, spec.tracking.l1ca)
-    got = run._rmd["G01"] / live.METRES_PER_CHIP**2
+    got = run._noise.variance_m2["G01"] / METRES_PER_CHIP**2
     # Relative standard error of both mean squares below sqrt(2/n) times a correlation factor of 2.
     assert abs(got / x.var() - 1) < Z * 2 * np.sqrt(2 / n)
     assert abs(x.var() - a / (2 - a)) < Z * 2 * np.sqrt(2 / n) * a / (2 - a)
@@ -186,9 +188,9 @@ def test_levels_from_the_table_bound_the_exact_ones():
     az, el = np.radians([20, 75, 140, 200, 255, 310, 0]), np.radians([35, 18, 42, 25, 55, 15, 80])
     h = np.column_stack([-np.cos(el) * np.sin(az), -np.cos(el) * np.cos(az), -np.sin(el), np.ones(7)])
     var = np.linspace(1.0, 9.0, 7)
-    exact, got = protection_levels(h, var, Limits()), live.levels(h, var, Limits())
+    exact, got = protection_levels(h, var, Limits()), quick_levels(h, var, Limits())
     for mine, theirs in zip(got, (exact.hpl_m, exact.vpl_m)):
-        assert theirs * (1 - 2e-4) < mine < theirs * (live.STEP + 2e-4)
+        assert theirs * (1 - 2e-4) < mine < theirs * (SLOPE_STEP + 2e-4)
 
 
 # --------------------------------------------------------------------------------------------------- faults and answers
@@ -295,7 +297,7 @@ def test_no_position_is_said(sky):
     run.watch(nav)
     rows = transmit(sky, T0)[:2]
     assert nav.update(rows, ephemerides(sky), remedy=run.remedy) is None
-    assert run(nav, int(T0 * FS_HZ)) == {}
+    assert run(int(T0 * FS_HZ)) == {}
     assert all(m["unavailable"] for m in run.report() if m["name"] != "noise_rmd")
 
 

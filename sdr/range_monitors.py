@@ -1,0 +1,232 @@
+"""Monitors on the ranges of one epoch: RAIM, the bias bank and the protection levels, and who among alike satellites lies.
+
+All use the receiver's noise as it stands and judge excluded satellites too. Two satellites whose rows of the parity weight
+are alike, rho = W_ij / sqrt(W_ii W_jj), explain a fault almost equally well: whoever is accused, the others that the last
+``MEMORY`` epochs leave possible are named beside it, and are left out with it where exclusion is asked for.
+"""
+
+import math
+
+import numpy as np
+
+from monitors.bias_bank import BiasBank, BiasReport, parity_weight
+from monitors.protection import chi2_limit, quick_levels
+from nav.frames import geodetic_from_ecef, rotation_enu_to_ecef
+from nav.navigator import Snapshot
+from nav.navlog import NavigatorLog
+from sdr.findings import PROTECTION, Alarms, found
+from sdr.respond import Response
+
+MEMORY = 50
+"""Epochs over which the onset of an identified bias is looked for, and rivals are weighed."""
+ODDS = 99.0
+"""A satellite is no rival once its own fault would be this much less likely."""
+
+
+class RangeMonitors:
+    """Run of the range monitors of an IntegritySpec; ``alarms`` by monitor, ``response`` what they may tell."""
+
+    def __init__(self, spec, response: Response, alarms: dict[str, Alarms]) -> None:
+        self.spec, self.response, self.alarms = spec, response, alarms
+        self._bank: BiasTracker | None = None if spec.bias_bank is None else BiasTracker(spec.bias_bank)
+        self._past: list[tuple[list[str], np.ndarray, np.ndarray]] = []
+        self._new_bias: dict[str, float] = {}
+        self._next_level_s = 0.0
+
+    def lack(self, reason: str) -> None:
+        """There are no ranges."""
+        for name in ("raim", "bias_bank"):
+            if name in self.alarms:
+                self.alarms[name].lack(reason)
+
+    def __call__(self, snap: Snapshot, sample: int, t_s: float, out: dict[str, np.ndarray]) -> None:
+        """One epoch; rows into ``out``."""
+        var = self.response.variance(snap.names, snap.own_m2)
+        shift = self.response.shifts(snap.names)
+        h = np.column_stack([-snap.los, np.ones(len(snap.names)), snap.second])
+        self._remember(snap.names, snap.residual_m + shift, h, var)
+        self._raim(snap, h, var, sample, t_s, out)
+        self._biases(snap.names, snap.residual_m + shift, h, var, sample, t_s, out)
+        self._protect(snap, h, var, sample, t_s, out)
+
+    # -- RAIM ---------------------------------------------------------------------------------------------------------
+
+    def _raim(self, snap, h, var, sample, t_s, out) -> None:
+        if self.spec.raim is None:
+            return
+        accused, first, reason = self._isolate(snap.residual_m, h, var)
+        if first is None:
+            self.alarms["raim"].lack(reason)
+            return
+        name = snap.names[first[1]]
+        rivals = self.rivals(name) if accused else []
+        out["raim"] = found([name], sample, t_s, first[0], 1.0, rivals=" ".join(rivals).encode())
+        if reason:
+            self.alarms["raim"].lack(reason)
+        several = len(accused) > 1 and len({snap.names[i][0] for i in accused}) == 1
+        if self.response.spec.fallback and accused and (several or reason):
+            self._fall_back(snap, h, var, t_s)
+        if "raim" in self.response.spec.exclude and not reason:
+            self.response.accuse([snap.names[i] for i in accused] + rivals, t_s)
+
+    def _isolate(self, residual, h, var):
+        """(suspects in the order in which they were left out, (chi2 / limit, first suspect) or None, why it ended)."""
+        part, accused, first = list(range(len(residual))), [], None
+        while True:
+            try:
+                w, dof = parity_weight(h[part], var[part])
+            except ValueError as error:
+                return accused, first, str(error).replace("The bias bank needs", "RAIM needs")
+            wr = w @ residual[part]
+            chi2, limit = float(residual[part] @ wr), chi2_limit(dof, self.spec.raim.p_false_alarm)
+            suspect = part[int(np.argmax(wr**2 / np.maximum(np.diag(w), 1e-12 / var[part])))]
+            first = first or (chi2 / limit, suspect)
+            if chi2 < limit:
+                return accused, first, ""
+            accused.append(suspect)
+            part.remove(suspect)
+
+    def _fall_back(self, snap, h, var, t_s) -> None:
+        """Keep to the constellation that agrees with itself, if exactly one does."""
+        agree = []
+        for system in "GE":
+            part = [i for i, n in enumerate(snap.names) if n[0] == system]
+            try:
+                w, dof = parity_weight(h[part], var[part])
+            except ValueError:
+                continue
+            r = snap.residual_m[part]
+            if r @ w @ r < chi2_limit(dof, self.spec.raim.p_false_alarm):
+                agree.append(system)
+        if len(agree) == 1:
+            self.response.keep(agree[0], t_s)
+
+    # -- who it is ----------------------------------------------------------------------------------------------------
+
+    def _remember(self, names, raw, h, var) -> None:
+        """Keep W r and the diagonal of W of the satellites that are not left out."""
+        wr, diag = np.zeros(len(names)), np.zeros(len(names))
+        try:
+            wr_all, _ = parity_weight(h, var)
+            wr[:], diag[:] = wr_all @ raw, np.diag(wr_all)
+        except ValueError:
+            pass
+        self._past.append((list(names), wr, diag))
+        del self._past[:-MEMORY]
+
+    def rivals(self, name: str) -> list[str]:
+        """Satellites whose own fault would explain the last epochs nearly as well as a fault of ``name``.
+
+        Fault of satellite i with shape s_k and size free: 2 ln L = (sum s_k (W r)_i)^2 / sum s_k^2 W_ii; the larger of a
+        bias and a ramp since the epoch that suits it best, at every fourth epoch of the memory.
+        """
+        names = self._past[-1][0]
+        wr, w = np.zeros((2, len(self._past), len(names)))
+        for k, (then, a, b) in enumerate(self._past):
+            at = [then.index(n) if n in then else -1 for n in names]
+            wr[k], w[k] = np.append(a, 0.0)[at], np.append(b, 0.0)[at]
+        best = np.zeros(len(names))
+        for first in range(0, len(self._past), 4):
+            for shape in (np.ones(len(wr) - first), np.arange(1.0, len(wr) - first + 1)):
+                size = np.maximum(shape**2 @ w[first:], 1e-12)
+                best = np.maximum(best, (shape @ wr[first:]) ** 2 / size)
+        if name not in names:
+            return []
+        close = best > best[names.index(name)] - 2.0 * math.log(ODDS)
+        return [n for n, c in zip(names, close) if c and n != name]
+
+    # -- bias bank ----------------------------------------------------------------------------------------------------
+
+    def _biases(self, names, raw, h, var, sample, t_s, out) -> None:
+        if self._bank is None:
+            return
+        gone = self.response.out(t_s)
+        report = self._bank(names, raw, h, var, np.array([n not in gone for n in names], bool))
+        if report is None:
+            self.alarms["bias_bank"].lack(self._bank.run.unavailable)
+            return
+        name, value, bias_m = self._bank.suspect(report)
+        rivals = self.rivals(name) if value >= self.spec.bias_bank.declare and name in names else []
+        limit = self.spec.bias_bank.declare
+        out["bias_bank"] = found([name], sample, t_s, value, limit, bias_m, " ".join(rivals).encode())
+        if self.response.spec.bias:
+            before = self.response.shift
+            self.response.shift = self._bank.correction(report)
+            self._new_bias = {n: b for n, b in self.response.shift.items() if not before}
+
+    def undo(self, log: NavigatorLog | None) -> np.ndarray | None:
+        """What a bias that was just identified has done to the filter's state since its onset, with the sign reversed.
+
+        Onset by cumulative sum: the epoch from which the log-likelihood ratio to now, sum of mu (W r)_i - mu^2 W_ii / 2,
+        is largest. The state it polluted follows c <- (I - K H) phi c + K_i mu.
+        """
+        if not self._new_bias or log is None or log.count == 0:
+            return None
+        (name, mu), self._new_bias = next(iter(self._new_bias.items())), {}
+        if name not in log.names:
+            return None
+        ratio = []
+        for names, wr, w in reversed(self._past[-min(log.count, log.length) :]):
+            at = names.index(name) if name in names else -1
+            ratio.append(mu * wr[at] - 0.5 * mu * mu * w[at] if at >= 0 else 0.0)
+        age = 1 + int(np.argmax(np.cumsum(ratio)))
+        part, row = log.log(age), log.names.index(name)
+        c = np.zeros(log.dx.size)
+        for e in range(age):
+            c = part.phi[e] @ c if e else c
+            c = c + part.k[e] @ ((np.arange(part.r.shape[1]) == row) * mu * part.used[e] - part.h[e] @ c)
+        return -c
+
+    # -- protection levels --------------------------------------------------------------------------------------------
+
+    def _protect(self, snap, h, var, sample, t_s, out) -> None:
+        if self.spec.protection is None or t_s < self._next_level_s:
+            return
+        limits = self.spec.protection
+        self._next_level_s = t_s + limits.every_s - 1e-6
+        use = snap.use
+        lat, lon, _ = geodetic_from_ecef(snap.pos_ecef_m)
+        enu = -snap.los[use] @ rotation_enu_to_ecef(lat, lon)
+        clocks = h[use][:, 3:]
+        if not np.ptp(clocks[:, 1]) > 0:
+            clocks = clocks[:, :1]
+        row = np.zeros(1, PROTECTION)
+        row["sample_index"], row["t_s"] = sample, t_s
+        row["hal_m"], row["val_m"] = limits.hal_m, limits.val_m
+        try:
+            row["hpl_m"], row["vpl_m"] = quick_levels(np.column_stack([enu, clocks]), var[use], limits)
+        except (ValueError, np.linalg.LinAlgError):
+            row["hpl_m"] = row["vpl_m"] = np.inf
+        out["protection"] = row
+
+
+class BiasTracker:
+    """A bias bank whose satellites come and go; the hypotheses of those that stay go on where they stood."""
+
+    def __init__(self, spec: BiasBank) -> None:
+        self.spec, self.names = spec, list[str]()
+        self.run = spec.start(1)
+
+    def __call__(self, names, raw, h, var, used) -> BiasReport | None:
+        """One epoch of satellites ``names``; see ``BiasBankRun``."""
+        new = [n for n in names if n not in self.names]
+        if new:
+            first = not self.names
+            self.names += new
+            self.run = self.spec.start(len(self.names)) if first else self.run.grown(len(self.names))
+        at = np.array([self.names.index(n) for n in names])
+        m = len(self.names)
+        r, hh, v, take = np.zeros(m), np.zeros((m, h.shape[1])), np.ones(m), np.zeros(m, bool)
+        r[at], hh[at], v[at], take[at] = raw, h, var, used
+        return self.run(r, hh, v, take)
+
+    def suspect(self, report: BiasReport) -> tuple[str, float, float]:
+        """(satellite, probability of its bias or 0 when it does not fit, bias in m) of the most probable bias."""
+        biased = np.flatnonzero(report.bias_m != 0)
+        best = int(biased[np.argmax(report.probability[biased])])
+        value = float(report.probability[best]) if report.fits or report.best != best else 0.0
+        return self.names[int(report.row[best])], value, float(report.bias_m[best])
+
+    def correction(self, report: BiasReport) -> dict[str, float]:
+        """Declared biases by name."""
+        return {n: float(b) for n, b in zip(self.names, self.run.correction_m(report)) if b}

@@ -1,0 +1,168 @@
+"""What the integrity monitors look at: the navigator, or the filter that steers the channels. One epoch, one face.
+
+``snapshot``: the ranges of the epoch (``nav.navigator.Snapshot``), None without a position; ``log``: the filter's epochs,
+``nav.navlog.NavigatorLog`` or ``monitors.normal_points.NormalPoints``, None where no filter runs; ``innovations(n)``: the last n
+epochs for an estimator that wants each innovation, ``fresh`` of them since the monitors' last epoch; ``p``: the covariance now.
+Both only read, but for ``hand``, which passes an answer on.
+"""
+
+from collections import deque
+from typing import Any
+
+import numpy as np
+
+from monitors.normal_points import NormalPoints
+from nav import ultratight_kernels as kernels
+from nav.eskf import EpochLog
+from nav.navigator import Navigator, Snapshot
+from nav.navlog import EXCLUDED_M2, NavigatorLog, Remedy
+from nav.steering import LEFT_OUT, SLOTS, Steering
+
+
+class NavigatorWatch:
+    """The navigator: least squares, or its Kalman filter where ``length`` epochs of a log are wanted."""
+
+    def __init__(self, navigator: Navigator, length: int) -> None:
+        self.navigator = navigator
+        if navigator.spec.kind == "ekf":
+            navigator.log = NavigatorLog(length=length)
+        self.slots = 0 if navigator.log is None else navigator.log.slots
+        self.fresh = 1
+        self._sample = -1
+
+    def look(self, sample: int) -> bool:
+        """Whether there is an epoch at ``sample`` to judge."""
+        self._sample = sample
+        return True
+
+    @property
+    def snapshot(self) -> Snapshot | None:
+        """Ranges of this epoch."""
+        return self.navigator.snapshot
+
+    @property
+    def reason(self) -> str:
+        """Why there are none, or no log."""
+        if self.navigator.snapshot is None:
+            return self.navigator.reason or "there was no position"
+        if self.navigator.spec.kind != "ekf":
+            return 'it reads a Kalman filter\'s log: set receiver.navigation.kind = "ekf"'
+        return "the filter has not started"
+
+    @property
+    def log(self) -> NavigatorLog | None:
+        """Log of the filter, when this epoch is in it."""
+        log, t_s = self.navigator.log, self._sample / self.navigator.fs_hz
+        return log if log is not None and log.count and log.last().t_s == t_s else None
+
+    @property
+    def p(self) -> np.ndarray:
+        """The filter's covariance now."""
+        return self.navigator._p
+
+    def innovations(self, n: int) -> EpochLog:
+        """The last n epochs."""
+        assert self.navigator.log is not None
+        return self.navigator.log.log(n)
+
+    def claimed(self, n: int) -> np.ndarray:
+        """(2S,) the receiver's own variances of one innovation."""
+        assert self.navigator.log is not None
+        return self.navigator.log.own
+
+    def hand(self, remedy: Remedy) -> Remedy:
+        """Everything is taken at the next epoch; after a reset what was logged belongs to another filter."""
+        if remedy.p is not None and self.navigator.log is not None:
+            self.navigator.log.drop()
+        return remedy
+
+
+class SteeringWatch:
+    """A steering filter: every epoch is gathered, ``per_look`` of them make one that is judged."""
+
+    def __init__(self, steering: Steering, length: int) -> None:
+        f = steering.filter
+        clock, drift = kernels.clock_states(f.code)
+        self.steering, self.filter, self.slots = steering, f, SLOTS
+        self.points = NormalPoints(f.p.shape[0], SLOTS, clock, drift)
+        self._gain = np.repeat(np.array([clock, drift]), SLOTS)
+        self._single: deque[np.ndarray] = deque(maxlen=length)
+        self.fresh, self._ready = 0, False
+
+    def gather(self) -> None:
+        """Take the filter's newest epoch into the window."""
+        f = self.filter
+        log = f.last()
+        self.points.add(log.phi, log.qd, log.h, log.r, f.own, f.dx)
+
+    def look(self, sample: int) -> bool:
+        """End the window at ``sample``; False when it does not count."""
+        st = self.steering
+        names = [None if n is None else f"{'G' if n[0] == 'L1CA' else 'E'}{n[1]:02d}" for n in st.name]
+        self._ready = self.points.close(sample / st.fs_hz, names, st.inflate, self.filter.p)
+        self.fresh = self.points.epochs
+        self._single.append(self.points.single)
+        return self._ready
+
+    @property
+    def snapshot(self) -> Snapshot | None:
+        """Ranges of this epoch: normal points about the trajectory at the window's start."""
+        p, st = self.points, self.steering
+        i = np.flatnonzero(p.seen[:SLOTS])
+        if not self._ready or not len(i):
+            return None
+        return Snapshot(
+            [str(p.names[k]) for k in i], self.filter.los[i].copy(), st.second[i].copy(), p.z[i], p.own[i] * st.inflate[i],
+            p.own[i], st.inflate[i] < LEFT_OUT, self.filter.position()[0],
+        )  # fmt: skip
+
+    @property
+    def reason(self) -> str:
+        """Why there are none."""
+        return "the steering filter was not fed"
+
+    @property
+    def log(self) -> NormalPoints | None:
+        """Normal points."""
+        return self.points if self._ready else None
+
+    @property
+    def p(self) -> np.ndarray:
+        """The filter's covariance now."""
+        return self.filter.p
+
+    def innovations(self, n: int) -> EpochLog:
+        """The last n epochs of the filter itself, rows of unit gain, ``s`` empty; without excluded rows."""
+        log = self.filter.log(n)
+        e = np.arange(SLOTS * 2)
+        g = log.h[:, e, self._gain]
+        used = log.used & (g > 0) & (log.var < 0.5 * EXCLUDED_M2)
+        g = np.where(used, g, 1.0)
+        return log._replace(
+            h=log.h / g[:, :, None], k=log.k * g[:, None, :], r=log.r / g, var=log.var / g**2, used=used
+        )
+
+    def claimed(self, n: int) -> np.ndarray:
+        """(2S,) the receiver's own variances of one innovation, mean over about the last n epochs."""
+        rows = np.array(self._single)[-max(1, round(n / max(self.fresh, 1))) :]
+        count = np.isfinite(rows).sum(axis=0)
+        return np.where(count > 0, np.nansum(rows, axis=0) / np.maximum(count, 1), 1.0)
+
+    def own_m2(self) -> dict[str, float]:
+        """The receiver's own variance of each range, to which an answer is in proportion."""
+        return {
+            str(n): float(v)
+            for n, v, s in zip(self.points.names, self.points.own, self.points.seen)
+            if n and s
+        }
+
+    def hand(self, remedy: Remedy) -> Remedy:
+        """A new state or covariance is taken at once, between two epochs; the rest by ``Steering.heed``."""
+        self.filter.correct(remedy.dx, remedy.p)
+        if remedy.p is not None:
+            self.points.restart(remedy.p)
+        return remedy._replace(dx=None, p=None)
+
+
+Watched = NavigatorWatch | SteeringWatch
+__all__: list[Any] = ["NavigatorWatch", "SteeringWatch", "Watched"]
