@@ -392,13 +392,7 @@ class RecordingSource:
         raw, sign = self._buffer[:size], -1 if self.declared.conjugate else 1
         if fmt.levels:
             _unpack(raw, offset, fmt.sample_bits, fmt.bits, fmt.complex, self._levels, sign, out, at, n)
-        elif fmt.dtype == "u1":
-            _split_int8((raw ^ 0x80).view(np.int8), fmt.complex, sign, out, at, n)
-        elif fmt.dtype == "i1":
-            _split_int8(raw.view(np.int8), fmt.complex, sign, out, at, n)
-        elif fmt.dtype == "<i2":
-            _split_int16(raw.view("<i2").astype(np.int16, copy=False), fmt.complex, sign, out, at, n)
-        else:
+        elif fmt.dtype == "<f4":
             bad = _split_float32(
                 raw.view("<f4").astype(np.float32, copy=False), fmt.complex, sign, out, at, n
             )
@@ -407,6 +401,22 @@ class RecordingSource:
                     f"'{self.declared.data}': sample {sample + bad} is not a finite number: the file is damaged, or the"
                     f" format is not {fmt.name}"
                 )
+        else:
+            self._split_integers(raw, sign, out, at, n)
+
+    def _split_integers(self, raw: np.ndarray, sign: int, out: np.ndarray, at: int, n: int) -> None:
+        """int8, offset binary or int16: both parts of a complex sample are read as one word."""
+        fmt = self.format
+        bits = fmt.bits if fmt.complex else 0
+        word = np.dtype(f"<i{fmt.sample_bits // 8}")
+        words = raw.view(word).astype(word.newbyteorder("="), copy=False)
+        flip = 0x80 * (0x0101 if fmt.complex else 1) if fmt.dtype == "u1" else 0
+        if flip:
+            words = words ^ np.array(flip).astype(words.dtype)
+        if fmt.complex:
+            _split_words(words, bits, sign, out, at)
+        else:
+            out[0, at : at + n], out[1, at : at + n] = words, 0
 
     def _load(self, offset: int, size: int) -> None:
         self._file.seek(offset)
@@ -431,46 +441,40 @@ def _unpack(raw, offset, sample_bits, bits, is_complex, levels, sign, out, at, n
         out[1, at + k] = q
 
 
-@njit(cache=True, nogil=True)
-def _split_int8(raw, is_complex, sign, out, at, n):
-    if not is_complex:
-        for k in range(n):
-            out[0, at + k] = raw[k]
-            out[1, at + k] = 0
-    elif sign > 0:
-        for k in range(n):
-            out[0, at + k] = raw[2 * k]
-            out[1, at + k] = raw[2 * k + 1]
-    else:
-        for k in range(n):
-            out[0, at + k] = raw[2 * k]
-            # -(-128) does not fit into 8 bits: 127 is nearest
-            out[1, at + k] = min(-np.int32(raw[2 * k + 1]), 127)
+# Unsigned indices: no test for negative ones, so that the loops become vector instructions.
 
 
 @njit(cache=True, nogil=True)
-def _split_int16(raw, is_complex, sign, out, at, n):
-    for k in range(n):
-        if is_complex:
-            out[0, at + k] = raw[2 * k]
-            out[1, at + k] = min(sign * np.int32(raw[2 * k + 1]), 32767)
-        else:
-            out[0, at + k] = raw[k]
-            out[1, at + k] = 0
+def _split_words(words, bits, sign, out, at):
+    """I in the ``bits`` low bits, Q in the high ones."""
+    a, top = np.uint64(at), np.int32((1 << (bits - 1)) - 1)
+    for k in range(np.uint64(len(words))):
+        q = np.int32(words[k]) >> np.int32(bits)
+        out[0, a + k] = words[k]
+        # -(-128) does not fit into 8 bits: 127 is nearest
+        out[1, a + k] = q if sign > 0 else min(-q, top)
 
 
 @njit(cache=True, nogil=True)
 def _split_float32(raw, is_complex, sign, out, at, n):
     """Returns the first sample that is not finite, or -1."""
-    bad = -1
-    for k in range(n):
-        i = raw[2 * k] if is_complex else raw[k]
-        q = np.float32(sign) * raw[2 * k + 1] if is_complex else np.float32(0)
-        if bad < 0 and not (np.isfinite(i) and np.isfinite(q)):
-            bad = k
-        out[0, at + k] = i
-        out[1, at + k] = q
-    return bad
+    a, two, one, turn, odd = np.uint64(at), np.uint64(2), np.uint64(1), np.float32(sign), 0
+    if is_complex:
+        for k in range(np.uint64(n)):
+            out[0, a + k] = raw[two * k]
+            out[1, a + k] = turn * raw[two * k + one]
+    else:
+        for k in range(np.uint64(n)):
+            out[0, a + k] = raw[k]
+            out[1, a + k] = 0
+    for k in range(np.uint64(len(raw))):
+        odd |= np.int32(not np.isfinite(raw[k]))
+    if not odd:
+        return -1
+    for k in range(len(raw)):
+        if not np.isfinite(raw[k]):
+            return k // 2 if is_complex else k
+    return -1
 
 
 @njit(cache=True, nogil=True)
