@@ -206,6 +206,7 @@ class SideBySide:
         return {
             "rms_2d_m": rms(e), "max_2d_m": float(e.max()), "rms_jam_2d_m": rms(e[jam]),
             "rms_speed_mps": rms(track["error_speed_mps"]), "satellites_lost": self.lost.get(mode),
+            "satellites": len(self._tracked.get(mode, ())) or None,
             "recovered_s": recovered, "valid_share": float(track["valid"].mean()),
         }  # fmt: skip
 

@@ -1,325 +1,417 @@
 """Seed 003 (Karaim et al. 2020): scalar, vector and ultra-tight GPS/RISS through 90 s of jamming.
 
 The paper gives neither J/S, C/N0, loop settings, R policy nor geometry. Here J/S is swept on the multi-satellite twin, and the
-table is set beside the J/S at which our vector receiver is as bad as the published one. Drive: 36 km/h with turns, 8 satellites,
-C/N0 44 dB-Hz, T 20 ms, jam from 180 to 270 s of 570 s; quick: 60 to 150 s of 180 s.
+table is set beside the J/S at which our vector receiver is as bad as the published one; then the three receivers run on
+IF samples. Drive: 36 km/h with turns, 8 satellites, C/N0 44 dB-Hz, T 20 ms, jam from 180 to 270 s of 570 s; quick: 60 to
+150 s of 180 s, without IF samples.
+
+Every part (50 runs of a point, or one run on samples) is a file in ``parts``, named by a digest of its settings: a command
+that was stopped goes on where it was.
 """
 
-import math
+import hashlib
+import os
+import sys
+import threading
+import time
+import zipfile
+import zlib
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from nav.ultratight import SteeringSpec
-from sdr.reproduce import new_figure, row, save_figure, write_table
-from sdr.uttwin import EVERY, T_S, Policy, Sky, Trial, batch, drive, replace, summary
+from nav.ultratight import MODES, SteeringSpec
+from sdr.uttwin import EVERY, T_S, Policy, Sky, Trial, drive, replace
 from sdr.uttwin import run as run_trial
-from signals.constants import CHIP_RATE_HZ
+from signals.jammers import CW, CodeLine, Narrowband
 
-TABLE_2 = {
-    "RMS": {
-        "scalar": (
-            105.09,
-            104.00,
-            96.42,
-            147.85,
-            176.52,
-            110762.21,
-            270450.6,
-            1266843.69,
-            292252.97,
-            1300117.20,
-        ),
-        "vector": (18.64, 3.55, 4.94, 18.97, 19.61, 150.48, 19.86, 17.53, 151.79, 152.80),
-        "ultra_tight": (0.0453, 0.6024, 0.0004, 0.6041, 0.6041, 5.5416, 17.42, 3.8763, 18.28, 18.68),
-    },
-    "MAX": {
-        "scalar": (
-            277.60,
-            277.21,
-            198.15,
-            392.31,
-            439.51,
-            264454.87,
-            580804.46,
-            2920567.08,
-            638177.25,
-            2989478.60,
-        ),
-        "vector": (51.82, 12.28, 30.01, 53.25, 61.13, 710.76, 267.32, 62.26, 759.37, 761.92),
-        "ultra_tight": (0.1860, 1.91, 0.0055, 1.92, 1.92, 20.73, 81.60, 10.51, 84.20, 84.85),
-    },
-}
-"""Published table 2."""
-ITEMS = ("Ve", "Vn", "Vu", "Spd2D", "Spd3D", "East", "North", "Up", "Pos2D", "Pos3D")
-MODES = ("scalar", "vector", "ultra_tight")
-SWEEP_DB = (20, 25, 30, 32.5, 35, 40, 42.5, 45, 47.5, 50, 52.5, 55, 60)
-QUICK_DB = (20, 30, 40, 45, 50, 55, 60)
+SWEEP_DB = (0, 20, 25, 30, 32.5, 35, 40, 42.5, 45, 47.5, 50, 52.5, 55, 60)
+QUICK_DB = (0, 20, 30, 40, 45, 50, 55, 60)
+SCALAR_DB = (27, 28, 29, 30, 31, 32, 33, 34, 35, 36)
+"""J/S at which the scalar receiver is looked at more closely."""
 BANDWIDTH_HZ = 2400.0
 SETTLED_S = 10.0
 RECOVERED_M = 20.0
+FIXED_DBHZ = 44.0
+SAMPLES_JAM_S = (45.0, 135.0)
+SAMPLES_S = 165.0
+SAMPLES_SEEDS = 5
+LINE_PRN = 8
+"""Satellite of the drive whose strongest line the CW hits."""
+
+ITEMS = ("Ve", "Vn", "Vu", "Spd2D", "Spd3D", "East", "North", "Up", "Pos2D", "Pos3D")
+RUN = np.dtype(
+    [
+        ("rms", "f8", (10,)), ("max", "f8", (10,)), ("rms_jam", "f8", (10,)), ("max_jam", "f8", (10,)),
+        ("end_2d_m", "f8"), ("n_lost", "i4"), ("no_fix", "f8"), ("nees", "f8", (4,)), ("nis_clean", "f8"), ("nis_jam", "f8"),
+    ]
+)  # fmt: skip
+"""One run of the twin: errors in the order of ITEMS over the whole run (after SETTLED_S) and over the jam, 2D error 30 s after
+the jam, satellites lost at its end, share of the jam without a fix, NEES (5 degrees of freedom: position, clock) before
+the jam, 30 s and 89 s into it and at the end, NIS over its rows before and in the jam."""
+ON_SAMPLES = np.dtype(
+    [
+        ("mode", "S11"), ("rms_2d_m", "f8"), ("max_2d_m", "f8"), ("rms_jam_2d_m", "f8"), ("max_jam_2d_m", "f8"),
+        ("rms_speed_mps", "f8"), ("rms_jam_speed_mps", "f8"), ("n_lost", "i4"), ("n_satellites", "i4"),
+        ("recovered_s", "f8"), ("no_fix", "f8"),
+    ]
+)  # fmt: skip
+"""One receiver on IF samples; ``recovered_s`` after the jam, nan: not by the end."""
+
+
+class Case(NamedTuple):
+    """One point of the twin."""
+
+    name: str
+    trial: Trial
+    spec: SteeringSpec
+    policy: Policy = Policy()
+    guarded: bool = True
+    """Scalar: lock detectors take channels out of the solution."""
+
+
+class SamplesCase(NamedTuple):
+    """One run on IF samples."""
+
+    name: str
+    jammer: Narrowband | CW
+    seed: int
+
+
+class Size(NamedTuple):
+    """How much is run."""
+
+    span_s: float
+    jam_s: tuple[float, float]
+    n_runs: int
+    levels: tuple[float, ...]
+
+
+QUICK = Size(180.0, (60.0, 150.0), 6, QUICK_DB)
+WHOLE = Size(570.0, (180.0, 270.0), 50, SWEEP_DB)
 
 
 def run(out_dir, quick=False, seed=0) -> list[dict]:
-    """Sweep, table 2, variants, effective Q and figures into ``out_dir``; whole: also on IF samples. Returns the rows."""
+    """Sweep, table 2, variants, consistency, effective Q and figures into ``out_dir``; whole: also on IF samples.
+
+    Returns the rows. Stopped and called again it goes on with the parts that it has.
+    """
+    from sdr.reproduce import karaim_report as report
+    from sdr.reproduce import write_table
+
     out = Path(out_dir)
-    out.mkdir(parents=True, exist_ok=True)
-    span_s, jam_s, n_runs = (180.0, (60.0, 150.0), 6) if quick else (570.0, (180.0, 270.0), 50)
-    sky = Sky(span_s, drive(span_s).start(span_s))
-    trial = Trial(jam_s=jam_s)
-    levels = QUICK_DB if quick else SWEEP_DB
-    results = {
-        js: {
-            m: batch(sky, replace(trial, js_db=js), SteeringSpec(mode=m), n_runs, seed, int(10 * js))
-            for m in MODES
-        }
-        for js in levels
-    }
-    rows = _sweep_rows(results, trial)
-    rows += _table_2(results, trial, sky, n_runs, seed)
-    rows += _variants(sky, trial, n_runs, seed)
-    rows += effective_q_rows()
-    if not quick:
-        rows += _on_samples()
-    _figures(out, sky, trial, results, seed)
+    size = QUICK if quick else WHOLE
+    cases = twin_cases(size)
+    samples = [] if quick else samples_cases(seed)
+    results = compute(out / "parts", cases, samples, size, seed)
+    rows = report.rows(results, cases, samples, size)
+    report.figures(out, results, size, sky(size.span_s), samples, seed)
     write_table(rows, out, "karaim2020")
     return rows
 
 
-def quantities(out: np.ndarray) -> np.ndarray:
-    """Errors of table 2 (runs, epochs, 10) in the order of ITEMS, from the twin's output."""
-    e, n, u, ve, vn, vu = (out[..., i] for i in range(6))
-    v2, p2 = np.hypot(ve, vn), np.hypot(e, n)
-    return np.stack([ve, vn, vu, v2, np.hypot(v2, vu), e, n, u, p2, np.hypot(p2, u)], axis=-1)
+# -- what is run ----------------------------------------------------------------------------------------------------
 
 
-def _interval(values) -> tuple[Any, Any, Any]:
-    """Median over runs and its distribution-free 95 % interval (order statistics)."""
-    values = np.sort(values[np.isfinite(values)])
-    if values.size == 0:
-        return None, None, None
-    half = 0.98 * math.sqrt(values.size)
-    low, high = (
-        max(0, math.floor(0.5 * values.size - half)),
-        min(values.size - 1, math.ceil(0.5 * values.size + half)),
-    )
-    return float(np.median(values)), float(values[low]), float(values[high])
+def twin_cases(size: Size) -> list[Case]:
+    """Sweep of the three receivers, the scalar one more closely and without lock detectors, variants."""
+    quiet = Trial(jam_s=size.jam_s)
+    at = lambda js: replace(quiet, js_db=float(js))  # noqa: E731
+    cases = [
+        Case(sweep_name(js, m), at(js), SteeringSpec(mode=m)) for js in size.levels for m in reversed(MODES)
+    ]
+    cases += [
+        Case(sweep_name(js, "scalar"), at(js), SteeringSpec())
+        for js in SCALAR_DB
+        if js not in size.levels and size is not QUICK
+    ]
+    cases += [
+        Case(unguarded_name(js), at(js), SteeringSpec(), guarded=False)
+        for js in size.levels
+        if js in VECTOR_DB
+    ]
+    return cases + _variants(at, replace(quiet, blocked_s=size.jam_s))
 
 
-def _sweep_rows(results, trial):
-    rows = []
-    for js, modes in results.items():
-        for mode, out in modes.items():
-            s = summary(out, replace(trial, js_db=js))
-            whole, jam = _interval(s["rms_2d_m"]), _interval(s["rms_jam_2d_m"])
-            lost = np.mean(~(s["end_2d_m"] < RECOVERED_M))
-            note = (
-                f"{np.mean(s['lost']):.1f} of {trial_satellites(out)} satellites lost at the end of the jam, "
-                f"{lost:.0%} of {out.shape[0]} runs not back 30 s later"
-            )
-            if mode == "scalar":
-                note += f", no fix for {np.mean(s['no_fix']):.0%} of the jam (rms of what was left)"
-            head = f"J/S {js:g} dB {mode}"
-            rows.append(row(f"{head}: Pos2D rms, jam only (m)", None, *jam, note=note))
-            rows.append(row(f"{head}: Pos2D rms, whole run (m)", None, *whole))
-    return rows
+VECTOR_DB = (45, 47.5, 50, 52.5, 55)
+"""Where the published vector receiver may be sought."""
 
 
-def trial_satellites(out):
-    """Satellites of a batch: as many as were in lock at its start."""
-    return int(out[:, 0, 11].max())
+def sweep_name(js_db: float, mode: str) -> str:
+    """Name of a point of the sweep."""
+    return f"J/S {js_db:g} dB {mode}"
 
 
-def _table_2(results, trial, sky, n_runs, seed):
-    """Table 2 beside ours at the J/S whose median vector Pos2D rms is nearest (in the logarithm) to the published."""
-    at = (np.arange(next(iter(results.values()))["vector"].shape[1]) + 1) * T_S * EVERY > SETTLED_S
-    published = TABLE_2["RMS"]["vector"][8]
-
-    def rms(out):
-        return np.sqrt(np.nanmean(quantities(out)[:, at] ** 2, axis=1))
-
-    js = min(results, key=lambda j: abs(math.log(np.median(rms(results[j]["vector"])[:, 8]) / published)))
-    rows = []
-    for mode in MODES:
-        out = results[js][mode]
-        if mode == "scalar":  # the published solution goes on without any detector of lock
-            out = batch(
-                sky, replace(trial, js_db=js), SteeringSpec(), n_runs, seed, int(10 * js), guarded=False
-            )
-        with np.errstate(all="ignore"):
-            ours = {"RMS": rms(out), "MAX": np.nanmax(np.abs(quantities(out)[:, at]), axis=1)}
-        for kind, values in ours.items():
-            for i, item in enumerate(ITEMS):
-                middle, low, high = _interval(values[:, i])
-                claim = TABLE_2[kind][mode][i]
-                rows.append(
-                    row(
-                        f"Table 2 at J/S {js:g} dB: {item} {kind} {mode}",
-                        claim,
-                        middle,
-                        low,
-                        high,
-                        *_verdict(mode, claim, middle),
-                    )
-                )
-    return rows
+def unguarded_name(js_db: float) -> str:
+    """Name of a scalar point without lock detectors."""
+    return f"J/S {js_db:g} dB scalar without lock detectors"
 
 
-def _verdict(mode, claim, ours):
-    if mode == "scalar":
-        return (
-            "not reproduced",
-            "free divergence without lock detectors depends on nothing physical; guarded, ours says no fix",
-        )
-    if mode == "vector":
-        return (
-            "reproduced" if ours / 3 <= claim <= ours * 3 else "not reproduced"
-        ), "J/S chosen by Pos2D; within a factor of 3"
-    better = "ours is better: R follows the C/N0 of the last 0.1 s" if ours < claim else ""
-    return ("reproduced" if ours / 3 <= claim <= ours * 3 else "not reproduced"), better
-
-
-def _variants(sky, trial, n_runs, seed):
-    """The ultra-tight receiver without GPS, with other error models and other policies for R; the gated vector receiver."""
+def _variants(at, blocked: Trial) -> list[Case]:
+    """The ultra-tight receiver without GPS, with other error models and other policies for R; other vector receivers."""
     ut, vt = SteeringSpec(mode="ultra_tight"), SteeringSpec(mode="vector")
     model = lambda kind: SteeringSpec(mode="ultra_tight", model=kind)  # noqa: E731
-    fixed = Policy(fixed_dbhz=44.0, use_gain=False)
-    no_gain = Policy(use_gain=False, fast_s=1.0)
-    blocked = replace(trial, blocked_s=trial.jam_s)
+    fixed = Policy(use_gain=False, fixed_dbhz=FIXED_DBHZ)
+    trusting = ut.model_copy(update={"limit_sigma": 0.0})
+    slow = Policy(use_gain=False, fast_s=1.0)
     cases = [
-        ("RISS alone, signals blocked", blocked, ut, Policy()),
-        ("full IMU (17 states) alone, signals blocked", blocked, model("ecef17"), Policy()),
-        ("J/S 55 dB, RISS with scale factor", replace(trial, js_db=55), ut, Policy()),
-        ("J/S 55 dB, RISS 11 states as printed", replace(trial, js_db=55), model("riss11"), Policy()),
-        ("J/S 55 dB, full IMU (17 states)", replace(trial, js_db=55), model("ecef17"), Policy()),
-        ("J/S 50 dB ultra-tight, R fixed at 44 dB-Hz", replace(trial, js_db=50), ut, fixed),
-        ("J/S 60 dB ultra-tight, R fixed at 44 dB-Hz", replace(trial, js_db=60), ut, fixed),
-        ("J/S 45 dB vector, no gain, C/N0 over 1 s", replace(trial, js_db=45), vt, no_gain),
-        (
-            "J/S 45 dB vector, skips below 17.8 dB-Hz",
-            replace(trial, js_db=45),
-            vt,
-            Policy(False, 0.0, 1.0, 1.0, 17.8),
-        ),
+        Case("RISS alone, signals blocked", blocked, ut),
+        Case("full IMU (17 states) alone, signals blocked", blocked, model("ecef17")),
     ]
-    rows = []
-    for k, (name, t, spec, policy) in enumerate(cases):
-        s = summary(batch(sky, t, spec, n_runs, seed, 1000 + k, policy), t)
-        note = f"back below {RECOVERED_M:g} m 30 s later: {np.mean(s['end_2d_m'] < RECOVERED_M):.0%} of {n_runs} runs"
-        rows.append(row(f"{name}: Pos2D rms, jam only (m)", None, *_interval(s["rms_jam_2d_m"]), note=note))
-    return rows
+    for js in (0, 45, 55):
+        cases += [
+            Case(f"J/S {js} dB, full IMU (17 states)", at(js), model("ecef17")),
+            Case(f"J/S {js} dB, RISS 11 states as printed", at(js), model("riss11")),
+        ]
+    for js in (45, 50, 55, 60):
+        cases.append(Case(f"J/S {js} dB ultra-tight, R of {FIXED_DBHZ:g} dB-Hz for ever", at(js), ut, fixed))
+    for js in (45, 50, 55, 60):
+        cases.append(Case(f"J/S {js} dB ultra-tight, the same, no innovation limit", at(js), trusting, fixed))
+    for js in (40, 45, 50):
+        cases.append(Case(f"J/S {js} dB vector, no gain, C/N0 over 1 s", at(js), vt, slow))
+    skips = Policy(use_gain=False, fast_s=1.0, skip_below_dbhz=17.8)
+    return [*cases, Case("J/S 45 dB vector, skips below 17.8 dB-Hz", at(45), vt, skips)]
 
 
-def effective_q(
-    prn: int, doppler_hz: float, offset_hz: float = 0.0, bandwidth_hz: float = BANDWIDTH_HZ
-) -> float:
-    """Q of C/N0_eff = 1 / (1/C/N0 + (J/S) / (Q R_c)) for flat noise of this bandwidth at L1 + offset, in dB.
+def samples_jammers() -> list[tuple[str, Narrowband | CW]]:
+    """The 2.4 kHz tone, a CW on a line, and one swept over +-5 kHz in the 90 s."""
+    start, stop = SAMPLES_JAM_S
+    times: dict[str, Any] = {"against": "G01", "start_s": start, "stop_s": stop}
+    found: list[tuple[str, Narrowband | CW]] = [
+        (f"2.4 kHz tone, J/S {js} dB", Narrowband(bandwidth_hz=BANDWIDTH_HZ, js_db=js, **times))
+        for js in (30, 45, 50, 55)
+    ]
+    line = CodeLine(signal="L1CA", prn=LINE_PRN, line="worst")
+    found.append(
+        (f"CW on the strongest line of G{LINE_PRN:02d}, J/S 45 dB", CW(js_db=45, line=line, **times))
+    )
+    sweep = CW(js_db=45, freq_hz=-5e3, rate_hz_s=1e4 / (stop - start), **times)
+    return [*found, ("CW swept over +-5 kHz, J/S 45 dB", sweep)]
 
-    Lines of the received code stand at f_d + k / 1 ms; Q = B / (R_c sum |c_k|^2) over the lines inside (Betz 2001 with a
-    line spectrum). inf where no line lies inside.
-    """
-    from tracking.correlator_model import code_spectrum
 
-    k = np.arange(-20, 21)
-    f = doppler_hz + k * 1e3 - offset_hz
-    power = np.abs(code_spectrum("L1CA", prn, k[np.abs(f) < 0.5 * bandwidth_hz])) ** 2
-    total = float(power.sum())
-    return math.inf if total == 0.0 else 10 * math.log10(bandwidth_hz / (CHIP_RATE_HZ * total))
+def samples_cases(seed: int) -> list[SamplesCase]:
+    """Every jammer with SAMPLES_SEEDS seeds."""
+    return [
+        SamplesCase(name, jammer, SAMPLES_SEEDS * seed + i)
+        for name, jammer in samples_jammers()
+        for i in range(SAMPLES_SEEDS)
+    ]
 
 
-def effective_q_rows():
-    """Effective Q of the 2.4 kHz tone against each satellite of the built-in drive, at its Doppler when the jam starts."""
+# -- parts ----------------------------------------------------------------------------------------------------------
+
+
+Results = dict[Any, dict[str, np.ndarray]]
+"""Case -> arrays of its part."""
+
+
+def compute(directory: Path, cases, samples, size: Size, seed: int) -> Results:
+    """Every part: read where a file has it, else computed, on two threads (kernels release the interpreter)."""
+    directory.mkdir(parents=True, exist_ok=True)
+    stop = threading.Event()
+    work: list[tuple[Any, Path, Any, tuple]] = []
+    for case in cases:
+        path = directory / _file_name(case.name, (case, size.span_s, size.n_runs, seed))
+        work.append((case, path, twin_part, (case, size, seed, stop)))
+    for one in samples:
+        work.append((one, directory / _file_name(one.name, one), samples_part, (one, stop)))
+    kept = {case: arrays for case, path, _, _ in work if (arrays := _read(path)) is not None}
+    todo = [w for w in work if w[0] not in kept]
+    if kept:
+        _say(f"{len(kept)} of {len(work)} parts are in {directory}")
+    began, results = time.monotonic(), dict(kept)
+    with ThreadPoolExecutor(min(2, os.cpu_count() or 1)) as pool:
+        try:
+            running = {pool.submit(_keep, path, f, a): (case, path) for case, path, f, a in todo}
+            for n, done in enumerate(as_completed(running), 1):
+                case = running[done][0]
+                results[case] = done.result()
+                left = (time.monotonic() - began) / n * (len(todo) - n) / 60
+                _say(f"{len(kept) + n} of {len(work)}: {case.name}; about {left:.0f} min left")
+        except BaseException:
+            stop.set()
+            pool.shutdown(wait=True, cancel_futures=True)
+            raise
+    return results
+
+
+def _say(text: str) -> None:
+    print(f"karaim2020: {text}", file=sys.stderr, flush=True)
+
+
+def _file_name(name: str, settings: Any) -> str:
+    digest = hashlib.sha256(repr(settings).encode()).hexdigest()[:12]
+    slug = "".join(c if c.isalnum() else "-" for c in name)
+    return f"{slug[:60]}-{digest}.npz"
+
+
+def _read(path: Path) -> dict[str, np.ndarray] | None:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return {k: file[k] for k in file.files}
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile):
+        return None
+
+
+def _keep(path: Path, function, arguments) -> dict[str, np.ndarray]:
+    """Compute a part and put its file in place whole."""
+    arrays = function(*arguments)
+    half = path.with_suffix(".part")
+    with half.open("wb") as file:
+        np.savez(file, **arrays)
+    os.replace(half, path)
+    return arrays
+
+
+class Stopped(Exception):
+    """A part was given up because another failed or the command was interrupted."""
+
+
+def twin_part(case: Case, size: Size, seed: int, stop=None) -> dict[str, np.ndarray]:
+    """``runs`` (n_runs,) RUN of one case; trial i has the seed (seed, spawn_key (crc32 of the name, i))."""
+    rows, point = [], zlib.crc32(case.name.encode())
+    for i in range(size.n_runs):
+        if stop is not None and stop.is_set():
+            raise Stopped
+        sequence = np.random.SeedSequence(seed, spawn_key=(point, i))
+        rows.append(measure(run_trial(sky(size.span_s), case.trial, case.spec, sequence, case.policy, case.guarded),
+                            case.trial.jam_s))  # fmt: skip
+    return {"runs": np.array(rows, RUN)}
+
+
+_SKY = threading.Lock()
+
+
+def sky(span_s: float) -> Sky:
+    """Geometry of the drive, made once."""
+    with _SKY:
+        return _sky(span_s)
+
+
+@lru_cache(maxsize=2)
+def _sky(span_s: float) -> Sky:
+    return Sky(span_s, drive(span_s).start(span_s))
+
+
+def measure(out: np.ndarray, jam_s: tuple[float, float]) -> np.void:
+    """RUN of one trial's output (epochs, N_OUT)."""
+    e, n, u, ve, vn, vu = (out[:, i] for i in range(6))
+    v2, p2 = np.hypot(ve, vn), np.hypot(e, n)
+    q = np.stack([ve, vn, vu, v2, np.hypot(v2, vu), e, n, u, p2, np.hypot(p2, u)], axis=1)
+    t = (np.arange(len(out)) + 1) * T_S * EVERY
+    at = lambda x: int(np.argmin(np.abs(t - min(x, t[-1]))))  # noqa: E731
+    whole, jam = t > SETTLED_S, (t > jam_s[0]) & (t <= jam_s[1])
+    clean = whole & (t <= jam_s[0])
+    row = np.zeros(1, RUN)[0]
+    with np.errstate(all="ignore"):
+        for suffix, mask in (("", whole), ("_jam", jam)):
+            fixed = q[mask & np.isfinite(p2)]
+            row["rms" + suffix] = np.sqrt(np.mean(fixed**2, axis=0)) if len(fixed) else np.nan
+            row["max" + suffix] = np.max(np.abs(fixed), axis=0) if len(fixed) else np.nan
+        row["nis_clean"] = np.mean(out[clean, 9]) / np.mean(out[clean, 10])
+        row["nis_jam"] = np.mean(out[jam, 9]) / np.mean(out[jam, 10])
+    row["end_2d_m"] = p2[at(jam_s[1] + 30.0)]
+    row["n_lost"] = out[0, 11] - out[at(jam_s[1]), 11]
+    row["no_fix"] = np.mean(~np.isfinite(p2[jam]))
+    row["nees"] = out[[at(jam_s[0] - 1.0), at(jam_s[0] + 30.0), at(jam_s[1] - 1.0), at(t[-1])], 8]
+    return row
+
+
+# -- IF samples -----------------------------------------------------------------------------------------------------
+
+
+def samples_scenario(jammer: Narrowband | CW, seed: int):
+    """The built-in drive with 90 s of another jammer and turns throughout."""
     from sdr import scenario
 
-    spec, _ = scenario.load("drive-jam")
-    source = scenario.source(spec)
-    sky = source.sky.propagate(np.array([spec.jammer[0].start_s]))
-    doppler = -1575.42e6 * sky.phase_delay_rate_s_s[:, 0]
-    rows = []
-    for s, f in zip(source.sky.satellites, doppler):
-        q = effective_q(s.prn, float(f))
-        rows.append(
-            row(
-                f"effective Q, {s.name} at {f:+.0f} Hz (dB)",
-                None,
-                q if math.isfinite(q) else None,
-                note="2.4 kHz tone at L1",
-            )
-        )
-    return rows
+    spec = scenario.load("drive-jam")[0]
+    place = {k: getattr(spec.motion, k) for k in ("lat_deg", "lon_deg", "height_m")}
+    changes = {
+        "seed": seed,
+        "duration_s": SAMPLES_S,
+        "motion": drive(SAMPLES_S, **place),
+        "jammer": (jammer,),
+    }
+    return spec.model_copy(update=changes)
 
 
-def _on_samples():
-    """The built-in drive on IF samples: the 2.4 kHz tone at three J/S, a pure CW on a line, and one swept over +-5 kHz."""
-    from signals.jammers import CW, CodeLine, Narrowband
-
-    times = {"against": "G01", "start_s": 45.0, "stop_s": 85.0}
-    jammers: list[tuple[str, CW | Narrowband]] = [
-        (f"2.4 kHz tone, J/S {js} dB", Narrowband(bandwidth_hz=BANDWIDTH_HZ, js_db=js, **times))
-        for js in (30, 45, 55)
-    ]
-    line = CodeLine(signal="L1CA", prn=8, line="worst")
-    jammers.append(("CW on the strongest line of G08, J/S 45 dB", CW(js_db=45, line=line, **times)))
-    jammers.append(("CW swept over +-5 kHz, J/S 45 dB", CW(js_db=45, freq_hz=-5e3, rate_hz_s=250.0, **times)))
-    rows = []
-    for name, jammer in jammers:
-        for mode, m in drive_on_samples(jammer).items():
-            note = f"{m['satellites_lost']} lost, recovered after {m['recovered_s']} s, max {m['max_2d_m']:.1f} m"
-            rows.append(
-                row(f"IF, {name}: {mode} Pos2D rms, jam only (m)", None, m["rms_jam_2d_m"], note=note)
-            )
-    return rows
-
-
-def drive_on_samples(jammer, **changes) -> dict[str, dict]:
-    """The built-in drive with another jammer, three receivers side by side; see ``sdr.modes``."""
+def samples_part(case: SamplesCase, stop=None) -> dict[str, np.ndarray]:
+    """``receivers`` (3,) ON_SAMPLES, and each receiver's TRACK: three receivers side by side, see ``sdr.modes``."""
     from sdr import scenario
     from sdr.modes import SideBySide
 
-    spec = scenario.load("drive-jam")[0].model_copy(update={"jammer": (jammer,), **changes})
+    spec = samples_scenario(case.jammer, case.seed)
     side = SideBySide(spec, scenario.source(spec), scenario.sensors(spec))
     for outcome in side.primary:
+        if stop is not None and stop.is_set():
+            raise Stopped
         side.follow(outcome)
-    return side.modes()
+    tracks, numbers = side.tracks(), side.modes()
+    rows = [_receiver(mode, tracks[mode], numbers[mode]) for mode in tracks]
+    return {"receivers": np.array(rows, ON_SAMPLES), **tracks}
 
 
-def _figures(out, sky, trial, results, seed):
-    """Spectrum of the tone (fig. 12), carrier frequencies of two satellites (fig. 13, 14), errors and the sweep."""
-    js = 50 if 50 in results else max(results)
-    t = (np.arange(sky.n_epochs // EVERY) + 1) * T_S * EVERY
-    figure, axes = new_figure(2, 1, sharex=True)
-    for ax, watch in zip(axes, (0, 3)):
-        for mode, color in zip(MODES, ("C3", "C1", "C0")):
-            trace = run_trial(
-                sky, replace(trial, js_db=js), SteeringSpec(mode=mode), seed, guarded=False, watch=watch
-            )
-            ax.plot(t, trace[:, 13], color, lw=0.7, label=mode)
-        ax.axvspan(*trial.jam_s, color="0.5", alpha=0.15)
-        middle = np.median(trace[:, 13])
-        ax.set(ylabel=f"Doppler of satellite {watch} (Hz)", ylim=(middle - 400, middle + 400))
-    axes[0].legend(fontsize=8)
-    axes[1].set_xlabel("time (s)")
-    save_figure(figure, out, "fig13_14_carrier")
-    figure, ax = new_figure(1, 1)
-    for mode, color in zip(MODES, ("C3", "C1", "C0")):
-        p2 = [np.median(summary(results[j][mode], trial)["rms_jam_2d_m"]) for j in results]
-        ax.semilogy(list(results), p2, color, marker="o", label=mode)
-    ax.set(xlabel="J/S (dB), Q = 1", ylabel="2D rms through the jam, median of runs (m)")
-    ax.legend()
-    save_figure(figure, out, "sweep")
-    _figure_12(out)
+def _receiver(mode: str, track: np.ndarray, numbers: dict) -> tuple:
+    jam = track[(track["t_s"] > SAMPLES_JAM_S[0]) & (track["t_s"] <= SAMPLES_JAM_S[1])]
+    rms = lambda x: float(np.sqrt(np.mean(x**2)))  # noqa: E731
+    back = numbers["recovered_s"]
+    return (
+        mode.encode(), numbers["rms_2d_m"], numbers["max_2d_m"], numbers["rms_jam_2d_m"], jam["error_2d_m"].max(),
+        numbers["rms_speed_mps"], rms(jam["error_speed_mps"]), numbers["satellites_lost"],
+        numbers["satellites"],
+        np.nan if back is None else back, np.mean(~jam["valid"]),
+    )  # fmt: skip
 
 
-def _figure_12(out):
-    from signals.jammers import Narrowband
+# -- effective Q ----------------------------------------------------------------------------------------------------
 
-    fs_hz, n = 64e3, 1 << 16
-    iq = np.zeros((2, n), np.float32)
-    Narrowband(bandwidth_hz=BANDWIDTH_HZ, jn0_dbhz=90.0).start(fs_hz, 0.0, n / fs_hz).add(iq, 0)
-    z = (iq[0] + 1j * iq[1]).reshape(-1, 2048) * np.hanning(2048)
-    psd = np.fft.fftshift(np.mean(np.abs(np.fft.fft(z, axis=1)) ** 2, axis=0))
-    figure, ax = new_figure(1, 1)
-    ax.plot(np.fft.fftshift(np.fft.fftfreq(2048, 1 / fs_hz)) / 1e3, 10 * np.log10(psd / psd.max()))
-    ax.set(xlim=(-10, 10), ylim=(-60, 3), xlabel="frequency from L1 (kHz)", ylabel="dB")
-    save_figure(figure, out, "fig12_spectrum")
+
+def effective_q(prn: int, doppler_hz, freq_hz, bandwidth_hz: float = BANDWIDTH_HZ) -> float:
+    """Q of C/N0_eff = 1 / (1/C/N0 + (J/S) / (Q R_c)) in dB, mean interference over the given instants.
+
+    Lines of the received code stand at f_d + k / 1 ms, |c_k|^2 of the power in each. A jammer of flat density in B around
+    ``freq_hz`` (from L1): 1/Q = R_c / B sum |c_k|^2 over the lines inside; ``bandwidth_hz`` 0, a CW integrated over T:
+    1/Q = R_c T sum |c_k|^2 sinc^2((f - f_k) T) (Betz 2001, with a line spectrum). inf where no line lies inside.
+    """
+    import math
+
+    from signals.constants import CHIP_RATE_HZ
+    from tracking.correlator_model import code_spectrum
+
+    f = np.atleast_1d(np.asarray(freq_hz, float) - np.asarray(doppler_hz, float))
+    reach = max(3, round(bandwidth_hz / 1e3))
+    k = np.round(f / 1e3).astype(int)[:, None] + np.arange(-reach, reach + 1)
+    off = f[:, None] - 1e3 * k
+    power = np.abs(code_spectrum("L1CA", prn, k)) ** 2
+    share = (
+        (np.abs(off) < 0.5 * bandwidth_hz) / bandwidth_hz if bandwidth_hz else T_S * np.sinc(off * T_S) ** 2
+    )
+    inverse = CHIP_RATE_HZ * float(np.mean(np.sum(power * share, axis=1)))
+    return math.inf if inverse == 0.0 else -10 * math.log10(inverse)
+
+
+def effective_qs() -> Iterator[tuple[str, str, float]]:
+    """(jammer, satellite, Q in dB) on the drive of the IF samples, mean over the jam."""
+    from sdr import scenario
+    from signals.constants import F_L1_HZ
+
+    jammers = [j for j in samples_jammers() if not j[0].startswith("2.4") or "45" in j[0]]
+    source = scenario.source(samples_scenario(jammers[0][1], 0))
+    t = np.arange(SAMPLES_JAM_S[0], SAMPLES_JAM_S[1], 0.05)
+    doppler = -F_L1_HZ * source.sky.propagate(t).phase_delay_rate_s_s
+    names = [s.name for s in source.sky.satellites]
+    for name, jammer in jammers:
+        if isinstance(jammer, Narrowband):
+            freq, width = np.zeros(t.size), jammer.bandwidth_hz
+        elif jammer.line is None:
+            freq, width = jammer.freq_hz + jammer.rate_hz_s * (t - t[0]), 0.0
+        else:
+            hit = doppler[names.index(f"G{jammer.line.prn:02d}")]
+            freq, width = hit + jammer.line.freq_hz() * (1.0 + hit / F_L1_HZ), 0.0
+        for s, f in zip(source.sky.satellites, doppler):
+            # Lines of a code that comes in at another rate stand wider by as much.
+            yield name, s.name, effective_q(s.prn, f * (1.0 + freq / F_L1_HZ), freq, width)
