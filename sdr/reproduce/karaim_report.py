@@ -73,7 +73,8 @@ def interval(values: np.ndarray) -> tuple[Any, Any, Any]:
 def _rate(item: str, events: np.ndarray, note: str = "") -> dict:
     """Row of a fraction of runs with its Clopper-Pearson interval."""
     k, n = int(np.sum(events)), len(events)
-    return row(item, None, k / n, *clopper_pearson(k, n), note=f"{k} of {n} runs" + note)
+    low, high = clopper_pearson(k, n)
+    return row(item, None, k / n, low, high, note=f"{k} of {n} runs{note}")
 
 
 def stayed_away(runs: np.ndarray) -> np.ndarray:
@@ -192,6 +193,7 @@ def _claims(runs, js_db: float) -> list[dict]:
     scalar, vector, tight = (runs[sweep_name(js_db, m)] for m in ("scalar", "vector", "ultra_tight"))
     at = f"at J/S {js_db:g} dB"
     back = 1.0 - stayed_away(vector).mean()
+    away_low, away_high = clopper_pearson(int(stayed_away(vector).sum()), len(vector))
     high = np.nanmax(tight["rms"][:, POS2D])
     riss, full = (
         runs[f"{m} alone, signals blocked"]["rms_jam"][:, POS2D] for m in ("RISS", "full IMU (17 states)")
@@ -203,8 +205,7 @@ def _claims(runs, js_db: float) -> list[dict]:
         row(f"claim: scalar loses some satellites, {at}", "some", scalar["n_lost"].mean(),
             verdict=says(scalar["n_lost"].min() >= 1), note="mean number lost of 8; does not track again by itself"),
         row(f"claim: vector recovers all satellites at once after the jam, {at}", "yes", back,
-            *(1.0 - b for b in reversed(clopper_pearson(int(stayed_away(vector).sum()), len(vector)))),
-            verdict=says(back > 0.5), note="fraction of runs back; the others are beyond one chip and need acquisition"),
+            1.0 - away_high, 1.0 - away_low, verdict=says(back > 0.5), note="fraction of runs back; the others are beyond one chip and need acquisition"),
         row(f"claim: ultra-tight tracks through the jam, {at}", "yes", tight["n_lost"].mean(),
             verdict=says(tight["n_lost"].max() == 0), note="mean number of satellites off at the end of the jam"),
         row(f"claim: ultra-tight Pos2D rms below 10 m (conclusion), {at}", "< 10", high,
@@ -237,8 +238,7 @@ def chi2_mean_bounds(dof: int, n: int) -> tuple[float, float]:
     """95 % interval of the mean of n independent chi-square variates."""
     from scipy.stats import chi2
 
-    low, high = chi2.ppf((0.025, 0.975), dof * n) / n
-    return float(low), float(high)
+    return float(chi2.ppf(0.025, dof * n)) / n, float(chi2.ppf(0.975, dof * n)) / n
 
 
 def _consistency(runs, cases):
