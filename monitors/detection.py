@@ -1,5 +1,4 @@
-"""From decisions to probabilities: intervals, P_MD in four definitions, ROC, time to alarm, importance
-sampling.
+"""From decisions to probabilities: intervals, P_MD in four definitions, ROC, time to alarm.
 
 Intervals. Clopper-Pearson is exact for independent trials. Epochs of one run share loop noise and fading:
 resample whole runs (``cluster_rate``) and print the effective number. Zero misses is an upper bound, never
@@ -17,7 +16,6 @@ __all__ = [
     "clopper_pearson",
     "cluster_rate",
     "first_alarm_s",
-    "importance_miss_rate",
     "p_md_curve",
     "p_md_event",
     "p_md_hazard",
@@ -28,6 +26,7 @@ __all__ = [
 
 HIT_LIMIT = 0.443
 """|df| T up to which a CW hits its line: half power of sinc^2, fixed beforehand."""
+_FEW_RUNS = 10
 
 
 @dataclass(frozen=True)
@@ -52,14 +51,14 @@ def clopper_pearson(k, n, confidence=0.95):
     """Exact two-sided interval of a binomial probability (Clopper & Pearson, Biometrika 26, 1934) -> (low,
     high).
 
-    ``k`` and ``n`` may be effective, hence not whole, numbers.
+    ``k`` and ``n`` may be effective, hence not whole, numbers; less than one event has no lower limit.
     """
     from scipy.special import betaincinv
 
     if not (n >= 0 and 0 <= k <= n):
         raise ValueError(f"{k} events in {n} trials: events must lie between 0 and the number of trials")
     alpha = 0.5 * (1 - confidence)
-    low = 0.0 if k <= 0 else float(betaincinv(k, n - k + 1, alpha))
+    low = 0.0 if k < 1 else float(betaincinv(k, n - k + 1, alpha))
     high = 1.0 if k >= n else float(betaincinv(k + 1, n - k, 1 - alpha))
     return low, high
 
@@ -71,7 +70,7 @@ def rate(k, n, confidence=0.95):
 
 
 def cluster_rate(k, n, seed, confidence=0.95, n_boot=2000, per_run=1.0):
-    """Rate from runs whose epochs depend on one another: bootstrap over runs.
+    """Rate from runs whose epochs depend on one another.
 
     Parameters
     ----------
@@ -84,36 +83,42 @@ def cluster_rate(k, n, seed, confidence=0.95, n_boot=2000, per_run=1.0):
 
     Notes
     -----
-    Percentile bootstrap of sum k / sum n; n_effective = p (1 - p) / variance, at most n. With fewer than 5
-    runs that have events it is the Clopper-Pearson interval of the share of such runs times their mean rate;
-    without events, that of zero in runs times ``per_run`` trials.
+    n_effective = p (1 - p) / variance of sum k / sum n, at most n; the variance is that between runs. The interval is
+    the wider of a percentile bootstrap over runs and of Clopper-Pearson on n_effective (z / t)^2 trials (Korn &
+    Graubard, Survey Methodology 24, 1998), which holds where the bootstrap has few events to draw from. With fewer
+    than 10 runs that have events (or that have others) neither holds: then every run counts as a single trial, with p
+    times the number of runs as its events; without events, as ``per_run`` trials.
     """
     k, n = np.asarray(k), np.asarray(n)
     if len(k) != len(n) or len(k) < 2:
         raise ValueError(
             f"{len(k)} runs: a cluster bootstrap needs at least two, with events and trials for each"
         )
-    total_k, total_n = int(k.sum()), int(n.sum())
+    total_k, total_n, runs = int(k.sum()), int(n.sum()), len(k)
     p = total_k / total_n
-    if np.count_nonzero(k) < 5 or np.count_nonzero(k < n) < 5:
-        hit_runs = int(np.count_nonzero(k))
-        low, high = clopper_pearson(min(hit_runs, len(k)), len(k), confidence)
-        share = p / (hit_runs / len(k)) if hit_runs else 1.0
-        if hit_runs and total_k < total_n:
-            return Rate(total_k, total_n, p, low * share, min(1.0, high * share), float(len(k)), confidence)
-        effective = min(float(total_n), len(k) * per_run)
-        if not hit_runs:
-            low, high = clopper_pearson(0, effective, confidence)
+    if min(np.count_nonzero(k), np.count_nonzero(k < n)) < _FEW_RUNS:
+        effective = min(float(total_n), runs * per_run) if total_k in (0, total_n) else float(runs)
+        low, high = clopper_pearson(p * effective, effective, confidence)
         return Rate(total_k, total_n, p, low, high, effective, confidence)
+    # Linearised variance of the ratio, not the bootstrap's own, which has Monte Carlo noise.
+    variance = np.sum((k - p * n) ** 2) / total_n**2 * runs / (runs - 1)
+    effective = min(float(total_n), p * (1 - p) / variance) if variance > 0 else float(total_n)
+    low, high = _survey_interval(p, effective, runs, confidence)
     rng = np.random.Generator(np.random.Philox(seed))
-    pick = rng.integers(0, len(k), (n_boot, len(k)))
+    pick = rng.integers(0, runs, (n_boot, runs))
     boot = k[pick].sum(axis=1) / n[pick].sum(axis=1)
     alpha = 0.5 * (1 - confidence)
-    low, high = np.quantile(boot, [alpha, 1 - alpha])
-    # Linearised variance of the ratio, not the bootstrap's own, which has Monte Carlo noise.
-    variance = np.sum((k - p * n) ** 2) / total_n**2 * len(k) / (len(k) - 1)
-    effective = min(float(total_n), p * (1 - p) / variance) if variance > 0 else float(total_n)
-    return Rate(total_k, total_n, p, float(low), float(high), effective, confidence)
+    left, right = np.quantile(boot, [alpha, 1 - alpha])
+    return Rate(total_k, total_n, p, min(low, float(left)), max(high, float(right)), effective, confidence)
+
+
+def _survey_interval(p, effective, runs, confidence):
+    """Clopper-Pearson on the effective number, reduced for a variance that ``runs`` runs estimate."""
+    from scipy.special import ndtri, stdtrit
+
+    upper = 0.5 + 0.5 * confidence
+    m = effective * (ndtri(upper) / stdtrit(runs - 1, upper)) ** 2
+    return clopper_pearson(p * m, m, confidence)
 
 
 def p_md_curve(df_t, missed, edges):
@@ -186,48 +191,3 @@ def roc(quiet, jammed, thresholds=None):
     p_fa = 1 - np.searchsorted(quiet, t, "left") / len(quiet)
     p_md = np.searchsorted(jammed, t, "left") / len(jammed)
     return t, p_fa, p_md
-
-
-def importance_miss_rate(run, amplitude, frequency_hz, threshold, n_draws, seed, shrink=1.0):
-    """P_MD of the GLRT against a CW, one epoch and no loops, by mean-shift importance sampling.
-
-    In whitened coordinates y = K u + noise, noise ~ CN(0, 2 s2 I), u = P W a(f). Draw it about the shift
-    sh = -(1 - x) K u, x = sqrt(2 s2 threshold) / (K |u|), where misses are common, and weight each miss by
-    exp(-(Re(sh^H noise) - |sh|^2 / 2) / s2).
-
-    Parameters
-    ----------
-    run : monitors.glrt.GlrtRun
-        Started with accumulate_epochs = 1 and a known noise variance.
-    amplitude : float
-        K, of the CW at one tap (prompt = 1).
-    shrink : float
-        Multiplies the shift; 0 is plain counting.
-
-    Returns
-    -------
-    p, relative_se, n_effective : float
-        n_effective = (sum w)^2 / sum w^2 over the misses.
-    """
-    s2 = run.noise_variance
-    a = np.exp(-2j * np.pi * run.taps_chips * frequency_hz / run.chip_rate_hz)
-    u = run.operator @ a * amplitude
-    norm = float(np.linalg.norm(u))
-    x = min(1.0, math.sqrt(2 * s2 * threshold) / norm)
-    shift = -shrink * (1 - x) * u
-    rng = np.random.Generator(np.random.Philox(seed))
-    weights = []
-    done = 0
-    while done < n_draws:
-        m = min(8192, n_draws - done)
-        g = rng.standard_normal((2, m, len(u)))
-        noise = math.sqrt(s2) * (g[0] + 1j * g[1]) + shift
-        log_w = -((noise @ shift.conj()).real - 0.5 * np.sum(np.abs(shift) ** 2)) / s2
-        missed = run.whitened_statistic(noise + u) < threshold
-        weights.append(np.where(missed, np.exp(log_w), 0.0))
-        done += m
-    w = np.concatenate(weights)
-    p = float(w.mean())
-    if p == 0.0:
-        return 0.0, math.inf, 0.0
-    return p, float(w.std() / math.sqrt(len(w)) / p), float(w.sum() ** 2 / np.sum(w * w))

@@ -12,16 +12,9 @@ from typing import Any
 import numpy as np
 
 from monitors.batch import sum_dumps, trial_seed
-from sdr.campaign import (
-    Campaign,
-    _line_offset_hz,
-    _span,
-    _trained,
-    fit_thresholds,
-    load,
-    quiet_statistics,
-)
+from sdr.campaign import Campaign, load
 from sdr.jobs import _progress
+from sdr.trials import fit_thresholds, offset_from_line_hz, quiet_statistics, span, trained
 from sdr.watch import one_blas_thread
 from signals.codes import primary_code
 from signals.constants import CHIP_RATE_HZ
@@ -52,7 +45,7 @@ def confirm(name: str, point: int, *, overrides: Sequence[str] = (), quiet: bool
     group = campaign.group[point]
     values = quiet_statistics(campaign.text, group, 0, campaign.spec.threshold.trials)
     limits = fit_thresholds(campaign, group, values)["threshold"]
-    runs = _trained(campaign.text, group)
+    runs = trained(campaign.text, group)
     seed = trial_seed(campaign.spec.seeds.evaluation, point, 0)
     with one_blas_thread():
         model = twin.start(seed)(settle + epochs)
@@ -172,11 +165,11 @@ class _Samples:
 def _series(run: Any, t_s: np.ndarray, corr: np.ndarray, twin: Twin) -> tuple[np.ndarray, np.ndarray]:
     """Mid-times and values of a monitor on a series of epochs, those near the line or of a noise-like jammer."""
     s = run.fresh()(sum_dumps(corr, 1))
-    middle = np.maximum(s["epoch"] - _span(run) // 2, 0)
+    middle = np.maximum(s["epoch"] - span(run) // 2, 0)
     t = t_s[middle]
     if not twin.jammers:
         return t, s["value"]
-    near = np.abs(_line_offset_hz(twin, t)) * twin.integration_s < 1.0
+    near = np.abs(offset_from_line_hz(twin, t)) * twin.integration_s < 1.0
     return t[near], s["value"][near]
 
 

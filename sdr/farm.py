@@ -23,19 +23,10 @@ import h5py
 import numpy as np
 
 from sdr import store, version
-from sdr.campaign import (
-    THRESHOLD,
-    TRIAL,
-    Campaign,
-    PointCount,
-    evaluate_trials,
-    fit_thresholds,
-    load,
-    quiet_statistics,
-    summarise,
-    warm_up,
-)
+from sdr.campaign import THRESHOLD, TRIAL, Campaign, load
 from sdr.jobs import _progress
+from sdr.tally import PointCount, advantages, summarise
+from sdr.trials import evaluate_trials, fit_thresholds, quiet_statistics, warm_up
 
 CHUNK_S = 1.0
 """Chunks of trials last about this long, so that handing them out costs nothing."""
@@ -61,6 +52,22 @@ RATE = np.dtype(
     ]
 )
 """Summary of one point and monitor."""
+
+ADVANTAGE = np.dtype(
+    [
+        ("axes", "S200"),  # JSON of the other axes
+        ("monitor", "S16"),
+        ("against", "S16"),
+        ("p_md", "f8"),
+        ("power_db", "f8"),  # where P_MD is p_md, in the unit of the power axis (dBW or J/S)
+        ("power_low_db", "f8"),
+        ("power_high_db", "f8"),
+        ("gain_db", "f8"),  # how much less power than "against" needs
+        ("gain_low_db", "f8"),
+        ("gain_high_db", "f8"),
+    ]
+)
+"""Jammer power that one monitor needs for one P_MD, and its advantage over the first monitor; NaN: not crossed."""
 
 
 def run(
@@ -285,6 +292,7 @@ class Results:
             RATE,
         )
         out.append("campaign/rates", table)
+        out.append("campaign/advantages", np.array([_advantage(r) for r in self.advantages()], ADVANTAGE))
         out.checkpoint(complete=complete)
         self.complete = complete
         self._last = time.monotonic()
@@ -293,6 +301,10 @@ class Results:
     def rows(self) -> list[dict[str, Any]]:
         """Summary rows of the points that have trials."""
         return summarise(self.campaign, self.counts, self.thresholds)
+
+    def advantages(self) -> list[dict[str, Any]]:
+        """Comparison of the monitors in dB of jammer power."""
+        return advantages(self.campaign, self.counts)
 
     def summary(self) -> dict[str, Any]:
         """The command's JSON object."""
@@ -304,15 +316,22 @@ class Results:
             "complete": self.complete,
             "trials": trials,
             "resumed_trials": self.resumed,
-            "epochs": trials * spec.trial.epochs,
+            "epochs": sum(c.done * self.campaign.length(c.index).epochs for c in self.counts),
             "p_fa": spec.p_fa_test,
             "points": self.rows(),
+            "advantages": self.advantages(),
         }
 
 
 def _for_hdf5(rows: list[dict[str, Any]]) -> Iterator[dict[str, Any]]:
     for r in rows:
         yield r | {"monitor": r["monitor"].encode(), "stop_reason": (r["stop_reason"] or "").encode()}
+
+
+def _advantage(r: dict[str, Any]) -> tuple:
+    pairs = (r["power_db"], *r["power_ci_db"]), (r["gain_db"], *r["gain_ci_db"])
+    numbers = [np.nan if v is None else v for pair in pairs for v in pair]
+    return json.dumps(r["axes"], default=str)[:200].encode(), r["monitor"].encode(), r["against"].encode(), r["p_md"], *numbers  # fmt: skip
 
 
 def _frames(f: Any, size: int) -> Iterator[tuple[bytes, bytes]]:
@@ -349,7 +368,7 @@ class _Local:
         method = "forkserver" if "forkserver" in mp.get_all_start_methods() else "spawn"
         context = mp.get_context(method)
         if method == "forkserver":
-            context.set_forkserver_preload(["sdr.campaign"])
+            context.set_forkserver_preload(["sdr.trials"])
         self._pool = futures.ProcessPoolExecutor(
             self.workers, mp_context=context, initializer=_obey, initargs=(os.getpid(),)
         )
@@ -577,9 +596,8 @@ class _Planner:
         return self
 
     def __next__(self) -> tuple[Any, Callable, tuple]:
-        most = self.campaign.spec.stop.max_trials
         for c in self.counts:
-            i = c.index
+            i, most = c.index, c.max_trials
             while c.reason is None and self.next[i] < most and c.has(self.next[i]):
                 self.next[i] += 1
             if c.reason is not None or self.next[i] >= most:
@@ -602,13 +620,13 @@ class _Planner:
             return 1
         return max(1, min(int(CHUNK_S / self.trial_s), -(-left // (2 * self.crew.workers))))
 
-    def _limits(self, point: int) -> tuple[float, ...]:
+    def _limits(self, point: int) -> np.ndarray:
         rows = self.limits[self.limits["group"] == self.campaign.group[point]]
-        return tuple(float(x) for x in rows["threshold"][np.argsort(rows["monitor"])])
+        return rows[np.argsort(rows["monitor"])]
 
 
 def _timed_trials(
-    text: str, point: int, first: int, count: int, limits: tuple[float, ...]
+    text: str, point: int, first: int, count: int, limits: np.ndarray
 ) -> tuple[np.ndarray, float]:
     warm_up(text, point)
     begin = time.perf_counter()
@@ -618,14 +636,13 @@ def _timed_trials(
 
 def _evaluate(campaign: Campaign, results: Results, crew: Any, quiet: bool) -> None:
     planner = _Planner(campaign, results, crew)
-    most = campaign.spec.stop.max_trials
-    total = most * len(results.counts)
+    total = sum(c.max_trials for c in results.counts)
     with _progress(campaign.spec.name, total, quiet) as advance:
         for (_, size), (rows, elapsed_s) in _each(crew, planner, lambda: 2 * crew.workers):
             planner.trial_s = max(elapsed_s / size, 1e-6)
             results.keep(rows)
             finished = sum(c.reason is not None for c in results.counts)
-            done = sum(most if c.reason is not None else c.done for c in results.counts)
+            done = sum(c.max_trials if c.reason is not None else c.done for c in results.counts)
             advance(done, f"{finished} of {len(results.counts)} points")
 
 
@@ -635,16 +652,45 @@ def _text(out: dict[str, Any]) -> str:
     ]
     if out["resumed_trials"]:
         rows[0] += f" ({out['resumed_trials']} trials were there already)"
-    for r in out["points"]:
-        axes = ", ".join(f"{k} = {v}" for k, v in r["axes"].items()) or "the only point"
-        rate = "none" if r["rate"] is None else f"{r['rate']:.3g}"
-        rows.append(
-            f"  {r['point']:4d}  {r['monitor']:16} {'P_FA' if r['definition'] == 'false_alarm' else 'P_MD'} {rate:>9} "
-            f"[{r['ci_low']:.2g}, {r['ci_high']:.2g}]  {r['k']}/{r['n']}, n_eff {r['n_effective']:.0f}, "
-            f"{r['trials']} trials ({r['stop_reason']})  {axes}"
-        )
+    rows += [_point_text(r) for r in out["points"]]
+    rows += [_advantage_text(r) for r in out["advantages"]]
     rows.append(f"results in {out['output']}")
     return "\n".join(rows + [f"  {p}" for p in out.get("figures", [])])
+
+
+def _point_text(r: dict[str, Any]) -> str:
+    rate = "none" if r["rate"] is None else f"{r['rate']:.3g}"
+    what = "P_FA" if r["definition"] == "false_alarm" else "P" if r["definition"] == "excess" else "P_MD"
+    counts = f"{r['k']}/{r['n']}" if r["method"] == "count" else f"{r['method']}, {r['n']} repetitions"
+    effective = "" if r["n_effective"] is None else f", n_eff {r['n_effective']:.3g}"
+    more = []
+    if r["first_alarm_median_s"] is not None:
+        more.append(f"first alarm {r['first_alarm_median_s']:.1f} s")
+    if r["undetected_code_error_m"] is not None and r["definition"] != "false_alarm":
+        more.append(f"undetected {r['undetected_code_error_m']:.1f} m raw, {r['undetected_smoothed_error_m']:.2f} m smoothed")  # fmt: skip
+    if "p_fa_approach" in r:
+        low, high = r["p_fa_approach_ci"]
+        more.append(f"per approach {r['p_fa_approach']:.2g} [{low:.2g}, {high:.2g}]")
+    return (
+        f"  {r['point']:4d}  {r['monitor']:16} {what:4} {rate:>9} [{r['ci_low']:.2g}, {r['ci_high']:.2g}]  {counts}{effective}, "
+        f"{r['trials']} trials ({r['stop_reason']})  " + "; ".join([_axes_text(r["axes"]), *more])
+    )
+
+
+def _advantage_text(r: dict[str, Any]) -> str:
+    def told(value: float | None, ci: list[float | None], sign: str) -> str:
+        bounds = "" if ci[0] is None else f" [{ci[0]:{sign}.2f}, {ci[1]:{sign}.2f}]"
+        return "not crossed by counted points" if value is None else f"{value:{sign}.2f}{bounds}"
+
+    unit = "dBW" if r["axis"].endswith("dbw") else "dB J/S"
+    text = f"  P_MD {r['p_md']:g} ({r['definition']}) of {r['monitor']:16} at {told(r['power_db'], r['power_ci_db'], '')} {unit}"
+    if r["monitor"] != r["against"]:
+        text += f"; {told(r['gain_db'], r['gain_ci_db'], '+')} dB against {r['against']}"
+    return f"{text}  {_axes_text(r['axes'])}"
+
+
+def _axes_text(axes: dict[str, Any]) -> str:
+    return ", ".join(f"{k} = {v}" for k, v in axes.items()) or "the only point"
 
 
 def read_rates(path: Path | str) -> h5py.File:

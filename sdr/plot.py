@@ -49,6 +49,10 @@ def plot(results: Path, directory: Path | None = None) -> list[Path]:
 
     directory = directory or Path(results).with_suffix("")
     with store.read(results) as h5:
+        if "campaign/points" in h5:
+            from sdr import campaign_plot
+
+            return campaign_plot.plot(results, directory)
         directory.mkdir(parents=True, exist_ok=True)
         channels = _channels(h5)
         drawn = []

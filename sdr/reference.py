@@ -284,6 +284,7 @@ def results_lines() -> Iterator[str]:
         ("trials (campaigns)", sdr.campaign, "TRIAL"),
         ("thresholds (campaigns)", sdr.campaign, "THRESHOLD"),
         ("rates (campaigns)", sdr.farm, "RATE"),
+        ("advantages (campaigns)", sdr.farm, "ADVANTAGE"),
     ):
         yield from record_lines(place, module, name)
 

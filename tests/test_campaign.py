@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 
 from monitors.detection import clopper_pearson
-from sdr import campaign, farm, store
-from sdr.campaign import TRIAL, PointCount, evaluate_trials, from_table, quiet_statistics
+from sdr import campaign, farm, store, tally, trials
+from sdr.campaign import THRESHOLD, TRIAL, from_table
+from sdr.tally import PointCount
+from sdr.trials import evaluate_trials, quiet_statistics
 
 TABLE = {
     "name": "small",
@@ -128,7 +130,8 @@ def test_workers_do_not_matter(reference, tmp_path):
 
 def test_a_trial_is_a_function_of_its_seed(reference):
     c = from_table(TABLE)
-    limits = (3.0, 10.0, 1.0)
+    limits = np.zeros(3, THRESHOLD)
+    limits["threshold"] = 3.0, 10.0, 1.0
     together = evaluate_trials(c.text, 2, 4, 3, limits)
     alone = evaluate_trials(c.text, 2, 6, 1, limits)
     assert together[-3:].tobytes() == alone.tobytes()
@@ -138,7 +141,7 @@ def test_a_trial_is_a_function_of_its_seed(reference):
 def test_the_three_sets_share_no_trial(reference):
     c = from_table(TABLE)
     draws = {
-        s: campaign._quiet_corr(c, 0, getattr(c.spec.seeds, s), 0, 10)
+        s: trials._quiet_corr(c, 0, getattr(c.spec.seeds, s), 0, 10)
         for s in ("training", "threshold", "evaluation")
     }
     assert not np.array_equal(draws["training"], draws["threshold"])
@@ -275,7 +278,7 @@ def test_no_errors_is_a_bound():
     c = counter(max_trials=40)
     for t in range(40):
         c.add(rows(t, 0, 1))
-    r = campaign.point_rate(np.zeros(40, int), np.ones(40, int), 0)
+    r = tally.point_rate(np.zeros(40, int), np.ones(40, int), 0)
     assert c.reason == "max_trials" and (r.low, r.high) == clopper_pearson(0, 40)
     assert r.high > 0.08
 

@@ -6,11 +6,12 @@ import pytest
 from scipy import stats
 
 from monitors.baselines import AdcHistogram, AgcGain, Cn0Drop, NoiseFloor, SignalQuality
-from monitors.detection import importance_miss_rate
 from monitors.fft import FftMonitor
 from monitors.glrt import GlrtMonitor
 from monitors.multichannel_ar import MultichannelAr, fit
+from monitors.rare import importance_miss_rate
 from monitors.records import alarms
+from signals.constants import CHIP_RATE_HZ
 from signals.modulation import autocorrelation
 from signals.multipath import Aeronautical, Echoes
 from tracking.correlator_model import Twin, TwinCW, code_spectrum, noise_sigma
@@ -179,16 +180,15 @@ def test_importance_sampling_against_formula_and_counting():
     line = abs(code_spectrum("L1CA", 6, 227))
     for js_db, df_t, plain in ((-1.0, 0.3, True), (1.5, 0.3, True), (4.0, 0.3, False), (9.0, 0.5, False)):
         amplitude = 10 ** (js_db / 20) * line * np.sinc(df_t)
-        p, se, n_eff = importance_miss_rate(run, amplitude, 227e3, threshold, 20_000, 1)
+        tone = amplitude * np.exp(-2j * np.pi * TAPS * 227e3 / CHIP_RATE_HZ)
+        p, se, n_eff = importance_miss_rate(run, tone, threshold, 20_000, 1)
         single = run.miss_probability(amplitude, 227e3, threshold)
         assert se < 0.06
         assert n_eff > 100
         # The maximum over all frequencies misses less often than the line's own bin, by a few per cent.
         assert p == pytest.approx(single, rel=Z * se + 0.08)
         if plain:
-            counted, se_counted, _ = importance_miss_rate(
-                run, amplitude, 227e3, threshold, 60_000, 2, shrink=0.0
-            )
+            counted, se_counted, _ = importance_miss_rate(run, tone, threshold, 60_000, 2, shrink=0.0)
             assert p == pytest.approx(counted, rel=Z * math.hypot(se, se_counted))
 
 

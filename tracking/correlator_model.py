@@ -12,6 +12,7 @@ Left out: the other component of E1, satellites of other codes, and changes of f
 integration (refused where they matter).
 """
 
+import copy
 import math
 from dataclasses import dataclass
 from functools import lru_cache
@@ -45,6 +46,7 @@ __all__ = [
     "TwinNBI",
     "TwinRun",
     "code_spectrum",
+    "cw_taps",
     "default_taps_chips",
     "jammer_hz",
     "noise_sigma",
@@ -407,6 +409,12 @@ def jammer_hz(spec, jammer):
     return (k or 0) / SIGNALS[spec.signal].code_period_s + jammer.offset_hz
 
 
+def cw_taps(spec, cw):
+    """Taps of a CW at its frequency of t = 0, phase zero at mid-interval, complex128 (K,); prompt of the signal = 1."""
+    x = np.array([jammer_hz(spec, cw) * spec.integration_s])
+    return 10 ** (cw.js_db / 20) * _tap_vectors(spec, x, spec.tap_array_chips)[0]
+
+
 def _keys(seed):
     """Independent random streams of one trial: noise key, symbol key, NBI key, Generator, echo seed, NBI
     seed.
@@ -695,6 +703,22 @@ class TwinRun:
             done += hi - lo
             self.epoch += hi - lo
         return _records(columns, self.epoch - n_epochs, self.spec.integration_s), corr
+
+    def branch(self, noise_key):
+        """A copy in this very state whose receiver noise is drawn anew from here on, by a key of 64 bits.
+
+        Jammers, their noise included, symbols and echoes stay those of this run.
+        """
+        run = copy.copy(self)
+        run.state = self.state.copy()
+        run.stage = copy.copy(self.stage)
+        run.stage.key = np.uint64(noise_key)
+        run.rest()
+        return run
+
+    def rest(self):
+        """Let go of the block at hand, which is made again when it is needed."""
+        self._block = None
 
     def _advance(self, index, lo, hi, steer, truth):
         b = self._prepare(index)
