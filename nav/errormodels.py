@@ -211,6 +211,42 @@ def pinson_state(lat_rad, lon_rad, height_m, vel_enu_mps, c_bn=None) -> PinsonSt
     )
 
 
+@njit(cache=True, nogil=True)
+def pinson13_f(c_en, radii_m, v, force_n, baro_rate, baro_gain, damped, coupling, f):
+    """F of the Pinson model into ``f`` (13, 13), seed 001, appendix A.1, wander azimuth (rho_z = 0).
+
+    ``radii_m`` (R_M + h, R_N + h); ``v``, ``force_n`` (3,) velocity and specific force in the navigation frame; ``damped`` 1 or 0 times -gain on the height,
+    ``coupling`` +-1 times gain from the barometer's error to it. The change of rho with height, V/R^2 dh, is left out as in
+    the seed.
+    """
+    crx, cry = 1.0 / radii_m[1], 1.0 / radii_m[0]
+    omega, both, d_rho = np.empty(3), np.empty(3), np.zeros((3, 3))
+    for i in range(3):
+        omega[i] = c_en[i, 2] * EARTH_RATE_RAD_S
+    rho = np.array([-v[1] * cry, v[0] * crx, 0.0])
+    d_rho[0, 1], d_rho[1, 0] = -cry, crx
+    sv, so, part = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    skew_into(v, sv)
+    skew_into(omega, so)
+    f[:] = 0.0
+    skew_into(-rho, f[0:3, 0:3])
+    f[0:3, 6:9] = d_rho
+    f[3:6, 6:9] = d_rho
+    f[3:6, 0:3] = so
+    skew_into(-(omega + rho), f[3:6, 3:6])
+    f[6:9, 0:3] = 2.0 * np.dot(sv, so)
+    skew_into(force_n, f[6:9, 3:6])
+    both[:] = -(2.0 * omega + rho)
+    skew_into(both, part)
+    f[6:9, 6:9] = part + np.dot(sv, d_rho)
+    f[8, 9] = 2.0 * EQUATORIAL_GRAVITY_MPS2 / WGS84_A_M
+    f[9, 8] = 1.0
+    f[9, 9] = -damped * baro_gain
+    f[9, 10] = coupling * baro_gain
+    f[10, 10] = -baro_rate
+    f[11, 12] = 1.0
+
+
 class Pinson13(BaseModel):
     """13 states of seed 001 (eq. 42, appendix A): dtheta(3) phi(3) dV(3) dh dhB b d, in SI units.
 
@@ -262,31 +298,16 @@ class Pinson13(BaseModel):
         return 12
 
     def f_matrix(self, nominal: PinsonState, specific_force_body_mps2: np.ndarray) -> np.ndarray:
-        """F (13, 13) of seed 001, appendix A.1, at the nominal state (rho_z = 0: wander azimuth).
-
-        The change of rho with height, V/R^2 dh, is left out as in the seed.
-        """
+        """F (13, 13) at the nominal state (``pinson13_f``)."""
+        f = np.empty((13, 13))
         r_m, r_n = earth_radii(latitude_of(nominal.c_en))
-        crx, cry = 1.0 / (r_n + nominal.height_m), 1.0 / (r_m + nominal.height_m)
-        v = nominal.vel_n_mps
-        omega = nominal.c_en @ EARTH_RATE_ECEF
-        rho = np.array([-v[1] * cry, v[0] * crx, 0.0])
-        d_rho = np.array([[0.0, -cry, 0.0], [crx, 0.0, 0.0], [0.0, 0.0, 0.0]])
-        f = np.zeros((13, 13))
-        f[0:3, 0:3] = -skew(rho)
-        f[0:3, 6:9] = f[3:6, 6:9] = d_rho
-        f[3:6, 0:3] = skew(omega)
-        f[3:6, 3:6] = -skew(omega + rho)
-        f[6:9, 0:3] = 2.0 * skew(v) @ skew(omega)
-        f[6:9, 3:6] = skew(nominal.c_bn @ specific_force_body_mps2)
-        f[6:9, 6:9] = -skew(2.0 * omega + rho) + skew(v) @ d_rho
-        f[8, 9] = 2.0 * EQUATORIAL_GRAVITY_MPS2 / WGS84_A_M
-        f[9, 8] = 1.0
-        k2 = self.baro_gain_per_s
-        f[9, 9] = 0.0 if self.printed_baro else -k2
-        f[9, 10] = k2 if self.form == "feedforward" else -k2
-        f[10, 10] = -self.baro_rate_per_s
-        f[11, 12] = 1.0
+        pinson13_f(
+            np.ascontiguousarray(nominal.c_en, dtype=np.float64),
+            (r_m + nominal.height_m, r_n + nominal.height_m),
+            np.asarray(nominal.vel_n_mps, np.float64), nominal.c_bn @ np.asarray(specific_force_body_mps2, np.float64),
+            self.baro_rate_per_s, self.baro_gain_per_s, 0.0 if self.printed_baro else 1.0,
+            1.0 if self.form == "feedforward" else -1.0, f,
+        )  # fmt: skip
         return f
 
     def q_diag(self) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Inertial sensors and odometer: one Spec both simulates them and tells the filter their noise.
+"""Inertial sensors, odometer and barometer: one Spec both simulates them and tells the filter their noise.
 
 Units in the Specs are those of data sheets; ``*_si`` properties are SI. Sensor axes are forward, right, down.
 measured = (I + M + diag(scale)) true + bias + noise, then quantised increments (IEEE Std 952, annex B;
@@ -11,9 +11,9 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from nav.errormodels import Ecef17
-from nav.frames import gravity_ecef
-from nav.records import IMU, ODOMETER
+from nav.errormodels import Ecef17, Pinson13
+from nav.frames import geodetic_from_ecef, gravity_ecef
+from nav.records import BAROMETER, IMU, ODOMETER
 from signals.attitude import attitude, specific_force_ecef
 from signals.constants import EARTH_RATE_RAD_S
 
@@ -135,6 +135,47 @@ class OdometerSpec(BaseModel):
     """Standard deviation of the scale factor error."""
     scale_tau_s: Annotated[float, Field(gt=0)] = 3600.0
     """Its correlation time."""
+
+
+class BarometerSpec(BaseModel):
+    """Section ``[sensors.barometer]``: height + Gauss-Markov bias (the weather) + white noise.
+
+    Size and correlation time of the bias are seed 001's (100 ft, 600 s; appendix A.2).
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    rate_hz: Annotated[float, Field(ge=1, le=1000)] = 10.0
+    """Output rate."""
+    bias_sigma_m: Annotated[float, Field(ge=0, le=1000)] = 30.0
+    """Standard deviation of the bias."""
+    bias_tau_s: Annotated[float, Field(gt=0)] = 600.0
+    """Its correlation time."""
+    noise_m: Annotated[float, Field(gt=0, le=100)] = 0.3
+    """White noise of a height, one sigma."""
+
+
+BIAS_MEMORY_S = 10.0
+"""A sensor bias for which a model has no state is taken as white noise that acts for this long in one direction."""
+
+
+def pinson13_of(
+    imu: ImuSpec, barometer: BarometerSpec, clock_phase_noise_m2_s, clock_freq_noise_m2_s3
+) -> Pinson13:
+    """The 13-state error model whose noise is that of an IMU and a barometer, as feedback filter.
+
+    It has no states for sensor biases: sigma^2 ``BIAS_MEMORY_S`` of both their parts stands in, which is honest for
+    navigation grade and coarse below. The barometer's noise comes in again through the height loop, k^2 sigma^2 / rate.
+    """
+    gyro, accel = math.hypot(*imu.gyro_bias_si), math.hypot(*imu.accel_bias_si)
+    gain = Pinson13().baro_gain_per_s
+    return Pinson13(
+        q_gyro_rad2_s=imu.gyro_noise_si**2 + gyro**2 * BIAS_MEMORY_S,
+        q_accel_m2_s3=imu.accel_noise_si**2 + accel**2 * BIAS_MEMORY_S,
+        q_height_m2_s=(gain * barometer.noise_m) ** 2 / barometer.rate_hz,
+        q_clock_m2_s=clock_phase_noise_m2_s, q_drift_m2_s3=clock_freq_noise_m2_s3,
+        baro_sigma_m=barometer.bias_sigma_m, baro_rate_per_s=1.0 / barometer.bias_tau_s,
+    )  # fmt: skip
 
 
 def ecef17_of(imu: ImuSpec, **other) -> Ecef17:
@@ -275,3 +316,15 @@ def simulate_odometer(motion, spec: OdometerSpec, seed, duration_s, fs_hz=1.0):
     rows["t_s"], rows["sample_index"] = t, np.round(t * fs_hz)
     rows["speed_mps"] = true / (1.0 - scale) + spec.noise_mps * rng.standard_normal(t.size)
     return rows, scale
+
+
+def simulate_barometer(motion, spec: BarometerSpec, seed, duration_s, fs_hz=1.0):
+    """BAROMETER rows and the true bias (m,): height = true height + bias + noise."""
+    rng = np.random.default_rng(seed)
+    t = _times(duration_s, spec.rate_hz)
+    rows = np.zeros(t.size, BAROMETER)
+    bias = gauss_markov(rng, spec.bias_sigma_m, spec.bias_tau_s, 1.0 / spec.rate_hz, t.size)
+    height = np.array([geodetic_from_ecef(p)[2] for p in np.ascontiguousarray(motion(t).pos_ecef_m)])
+    rows["t_s"], rows["sample_index"] = t, np.round(t * fs_hz)
+    rows["height_m"] = height + bias + spec.noise_m * rng.standard_normal(t.size)
+    return rows, bias

@@ -223,11 +223,15 @@ class Navigator:
         return self._klobuchar(iono_utc_gps)
 
     def handover(self):
-        """What a steering filter starts from: (copy of the receiver clock, clock bias in it (m), ISB (m) or None)."""
+        """What a steering filter starts from: (copy of the receiver clock, clock bias in it (m), ISB (m) or None).
+
+        The inter-system bias is Galileo's clock minus GPS's.
+        """
         if self._state is None:
             raise NoFix("there is no fix to start from.")
         known = self._isb_known or (self._filter_sample >= 0 and self._p[8, 8] < 100.0)
-        return copy(self.clock), float(self._state[3]), float(self._state[4]) if known else None
+        isb_m = float(self._state[4]) if self._reference == b"G" else -float(self._state[4])
+        return copy(self.clock), float(self._state[3]), isb_m if known else None
 
     def view(self):
         """VIEW rows: the satellites of the last epoch that had observations, in their order."""

@@ -106,6 +106,15 @@ ODOMETER = np.dtype(
 )
 """One output of the wheel speed sensor."""
 
+BAROMETER = np.dtype(
+    [
+        ("sample_index", "u8"),
+        ("t_s", "f8"),
+        ("height_m", "f8"),  # above the ellipsoid, as the pressure says
+    ]
+)
+"""One output of the barometric altimeter."""
+
 STEERING = np.dtype(
     [
         ("sample_index", "u8"),

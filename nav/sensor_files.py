@@ -2,7 +2,7 @@
 
 IMU: ``t_s, gyro_x_rad_s, gyro_y_rad_s, gyro_z_rad_s, accel_x_mps2, accel_y_mps2, accel_z_mps2``; axes
 forward, right, down; gravity left in, so that a level vehicle at rest reads accel_z = -9.8; means over the
-interval that ends at t_s. Odometer: ``t_s, speed_mps`` at t_s. ``t_s`` counts from the first IF sample, so
+interval that ends at t_s. Odometer: ``t_s, speed_mps`` at t_s. Barometer: ``t_s, height_m``. ``t_s`` counts from the first IF sample, so
 that the row belongs to sample round(t_s fs). Lines that start with # are comments.
 """
 
@@ -12,16 +12,18 @@ from pathlib import Path
 
 import numpy as np
 
-from nav.records import IMU, ODOMETER
+from nav.records import BAROMETER, IMU, ODOMETER
 
 IMU_COLUMNS = (
     "t_s", "gyro_x_rad_s", "gyro_y_rad_s", "gyro_z_rad_s", "accel_x_mps2", "accel_y_mps2", "accel_z_mps2",
 )  # fmt: skip
 ODOMETER_COLUMNS = ("t_s", "speed_mps")
+BAROMETER_COLUMNS = ("t_s", "height_m")
 MAX_BYTES = 4 << 30
 G0_MPS2 = 9.80665
 MAX_GYRO_RAD_S = 100.0
 MAX_SPEED_MPS = 500.0
+HEIGHTS_M = (-1000.0, 30_000.0)
 
 
 def write_imu(path, rows):
@@ -33,6 +35,11 @@ def write_imu(path, rows):
 def write_odometer(path, rows):
     """Write ODOMETER rows as CSV."""
     _write(path, np.column_stack([rows["t_s"], rows["speed_mps"]]), ODOMETER_COLUMNS)
+
+
+def write_barometer(path, rows):
+    """Write BAROMETER rows as CSV."""
+    _write(path, np.column_stack([rows["t_s"], rows["height_m"]]), BAROMETER_COLUMNS)
 
 
 def _write(path, table, columns):
@@ -79,6 +86,20 @@ def read_odometer(path, fs_hz, duration_s=None):
         raise ValueError(f"{path}: a speed of {fastest:.4g} m/s cannot be a wheel's; give m/s.")
     rows = np.zeros(table.shape[0], ODOMETER)
     rows["t_s"], rows["speed_mps"] = table.T
+    rows["sample_index"] = np.round(table[:, 0] * fs_hz)
+    return rows
+
+
+def read_barometer(path, fs_hz, duration_s=None):
+    """BAROMETER rows of a CSV file; errors as `read_imu`."""
+    table = _read(path, BAROMETER_COLUMNS, duration_s, "barometer")
+    low, high = float(table[:, 1].min()), float(table[:, 1].max())
+    if low < HEIGHTS_M[0] or high > HEIGHTS_M[1]:
+        raise ValueError(
+            f"{path}: heights from {low:.5g} to {high:.5g} m cannot be; give metres, not a pressure."
+        )
+    rows = np.zeros(table.shape[0], BAROMETER)
+    rows["t_s"], rows["height_m"] = table.T
     rows["sample_index"] = np.round(table[:, 0] * fs_hz)
     return rows
 

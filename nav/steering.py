@@ -13,7 +13,7 @@ import numpy as np
 
 from nav import pvt
 from nav import ultratight_kernels as kernels
-from nav.imu import ImuSpec, OdometerSpec
+from nav.imu import BarometerSpec, ImuSpec, OdometerSpec
 from nav.measurements import WEEK_MS
 from nav.navlog import Remedy
 from nav.records import SATELLITE, SOLUTION, STEERING
@@ -28,6 +28,7 @@ from nav.ultratight import (
     SteeringSpec,
     build_model,
     discriminator_table,
+    model_code,
     nominal_of,
     start_covariance,
 )
@@ -57,12 +58,14 @@ INCONSISTENT_RATIO = 6.0
 
 @dataclass(frozen=True)
 class Sensors:
-    """Rows of an IMU and an odometer that cover the samples, with the Specs that describe their noise."""
+    """Rows of an IMU, an odometer and a barometer that cover the samples, with the Specs that describe their noise."""
 
     imu_spec: ImuSpec
     odometer_spec: OdometerSpec | None
     imu: np.ndarray
     odometer: np.ndarray | None
+    barometer_spec: BarometerSpec | None = None
+    barometer: np.ndarray | None = None
 
     def table(self) -> np.ndarray:
         """Sensor rows (m, N_SENSOR) at IMU times."""
@@ -70,6 +73,11 @@ class Sensors:
         out[:, :3], out[:, 3:6] = self.imu["gyro_rad_s"], self.imu["accel_mps2"]
         if self.odometer is not None:
             out[:, 6] = speed_at(self.odometer, self.imu["t_s"])
+        out[:, 7] = np.nan
+        if self.barometer is not None:
+            at = np.searchsorted(self.imu["t_s"], self.barometer["t_s"] - 1e-6)
+            known = at < self.imu.size
+            out[at[known], 7] = self.barometer["height_m"][known]
         return out
 
 
@@ -92,7 +100,8 @@ class Steering:
         self.spec, self.fs_hz, self.sensors = spec, float(fs_hz), sensors
         self.min_elevation_rad = min_elevation_rad
         self.model = build_model(
-            spec, sensors.imu_spec if sensors else None, sensors.odometer_spec if sensors else None
+            spec,
+            *((sensors.imu_spec, sensors.odometer_spec, sensors.barometer_spec) if sensors else ()),
         )
         self.per_epoch, self.dt_s = 1, 1.0 / spec.update_hz
         self._table, self._sensor_sample = np.zeros((0, kernels.N_SENSOR)), np.zeros(0, np.int64)
@@ -190,7 +199,7 @@ class Steering:
             speed = float(self._table[max(row, 0), 6])
         x = nominal_of(
             self.model, pos, vel, bias_m, float(solution["clock_drift_mps"]), 0.0, azimuth,
-            speed if self.spec.model != "ecef17" else None,
+            speed if kernels.SCALE >= model_code(self.model) else None,
         )  # fmt: skip
         moving = max(float(np.linalg.norm(vel)), 1.0)
         imu = self.sensors.imu_spec if self.sensors else None
@@ -198,7 +207,9 @@ class Steering:
             self.model, x, pos_m=self.spec.range_sigma_m, vel_mps=0.2, bias_m=2.0 * self.spec.range_sigma_m, drift_mps=0.3,
             heading_rad=min(0.01 + 0.25 / moving, 0.3), imu=imu,
         )  # fmt: skip
-        self.filter, self._estimate_isb = Filter(self.spec, self.model, x, p, SLOTS, self.log_length), False
+        barometer = self.sensors.barometer_spec if self.sensors else None
+        self.filter = Filter(self.spec, self.model, x, p, SLOTS, self.log_length, barometer)
+        self._estimate_isb = False
 
     def meet(self, isb_m: float | None) -> None:
         """Learn Galileo's clock minus GPS's from the position stage; until then only the first system is steered."""

@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from nav import ultratight_kernels as kernels
 from nav.eskf import EpochLog, empty_log
 from nav.frames import earth_radii
+from nav.imu import BarometerSpec, ecef17_of, pinson13_of
 from nav.riss import DEG_H, HEIGHT, LAT, Riss11, RissSf, riss_nominal
 from nav.strapdown import attitude_from_velocity, coarse_attitude
 from signals.modulation import chip_acf
@@ -56,8 +57,8 @@ class SteeringSpec(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
     mode: Literal["scalar", "vector", "ultra_tight"] = "scalar"
     """Channels on their own loops, steered by the position filter, or by it with an IMU."""
-    model: Literal["kinematic", "riss_sf", "riss11", "ecef17"] | None = None
-    """None: kinematic for vector, riss_sf for ultra_tight."""
+    model: Literal["kinematic", "riss_sf", "riss11", "ecef17", "pinson13"] | None = None
+    """None: kinematic for vector, riss_sf for ultra_tight. The two RISS forms need an odometer, pinson13 a barometer."""
     update_hz: Annotated[float, Field(ge=5, le=50)] = 50.0
     """Rate at which the filter commands the channels."""
     compare: tuple[Literal["scalar", "vector", "ultra_tight"], ...] = ()
@@ -98,7 +99,9 @@ class SteeringSpec(BaseModel):
         if self.mode == "vector" and self.model not in (None, "kinematic"):
             raise ValueError(f'mode = "vector" has no sensors: its model is "kinematic", not "{self.model}"')
         if self.mode == "ultra_tight" and self.model == "kinematic":
-            raise ValueError('mode = "ultra_tight" needs an inertial model: "riss_sf", "riss11" or "ecef17"')
+            raise ValueError(
+                'mode = "ultra_tight" needs an inertial model: "riss_sf", "riss11", "ecef17" or "pinson13"'
+            )
         return self
 
     def with_mode(self, mode):
@@ -160,24 +163,26 @@ def model_code(model) -> int:
     """Kernel code of an error model."""
     if hasattr(model, "form_code"):
         return model.form_code
-    return {"ecef17": kernels.ECEF17, "kinematic": kernels.KINEMATIC}[model.kind]
+    return {"ecef17": kernels.ECEF17, "kinematic": kernels.KINEMATIC, "pinson13": kernels.PINSON}[model.kind]
 
 
-def model_rates(model) -> np.ndarray:
-    """Inverse correlation times of a model's bias states, padded to (3,)."""
+def model_rates(model, barometer=None) -> np.ndarray:
+    """What ``kernels.predict`` calls rates (3,): inverse correlation times of a model's bias states, and the barometer."""
     if hasattr(model, "rates_per_s"):
         own = model.rates_per_s
     elif model.kind == "ecef17":
         own = np.array([1.0 / model.accel_bias_tau_s, 1.0 / model.gyro_bias_tau_s])
+    elif model.kind == "pinson13":
+        own = np.array(
+            [model.baro_rate_per_s, model.baro_gain_per_s, (barometer or BarometerSpec()).noise_m ** 2]
+        )
     else:
         own = np.zeros(0)
     return np.concatenate([own, np.zeros(3 - own.size)])
 
 
-def build_model(spec: SteeringSpec, imu=None, odometer=None):
+def build_model(spec: SteeringSpec, imu=None, odometer=None, barometer=None):
     """The error model of a SteeringSpec with the noise of the sensors' Specs."""
-    from nav.imu import ecef17_of
-
     clock = {
         "clock_phase_noise_m2_s": spec.clock_phase_noise_m2_s,
         "clock_freq_noise_m2_s3": spec.clock_freq_noise_m2_s3,
@@ -185,13 +190,18 @@ def build_model(spec: SteeringSpec, imu=None, odometer=None):
     if spec.mode == "vector":
         return Kinematic(accel_psd_m2_s3=spec.accel_psd_m2_s3, **clock)
     kind = spec.model or "riss_sf"
-    if imu is None or (odometer is None and kind != "ecef17"):
-        needs = "an IMU" if kind == "ecef17" else "an IMU and an odometer"
-        raise ValueError(
-            f'receiver.steering.model = "{kind}" needs {needs}: add [sensors] or give --imu and --odometer'
+    beside = {"ecef17": None, "pinson13": "barometer"}.get(kind, "odometer")
+    if imu is None or (beside and {"barometer": barometer, "odometer": odometer}[beside] is None):
+        needs, options = (
+            ("an IMU", "--imu")
+            if beside is None
+            else (f"an IMU and {'an' if beside[0] == 'o' else 'a'} {beside}", f"--imu and --{beside}")
         )
+        raise ValueError(f'receiver.steering.model = "{kind}" needs {needs}: add [sensors] or give {options}')
     if kind == "ecef17":
         return ecef17_of(imu, **clock)
+    if kind == "pinson13":
+        return pinson13_of(imu, barometer, **clock)
     if kind == "riss_sf":
         return RissSf.from_sensors(imu, odometer, **clock)
     return Riss11(
@@ -224,6 +234,7 @@ def nominal_of(
             )
             x[6:15] = c.ravel()
             x[21], x[22] = bias_m, drift_mps
+            x[kernels.BARO_HEIGHT] = np.nan
     return x
 
 
@@ -248,6 +259,9 @@ def start_covariance(
         else:
             s[3], s[4] = heading_rad, model.scale_sigma
             s[5], s[6] = model.gyro_sigma_deg_h * DEG_H, 3.0 * model.pitch_sigma_mrad * 1e-3
+    elif code == kernels.PINSON:
+        s[0:2] = pos_m / np.linalg.norm(x[:3])
+        s[3:6], s[6:9], s[9], s[10] = heading_rad, vel_mps, 2.0 * pos_m, model.baro_sigma_m
     else:
         s[0:3], s[3:6] = 2.0 * pos_m, vel_mps
         if code == kernels.ECEF17:
@@ -271,11 +285,11 @@ class Filter:
     channel was not heard.
     """
 
-    def __init__(self, spec: SteeringSpec, model, x, p, n_channels, log_length=256):
+    def __init__(self, spec: SteeringSpec, model, x, p, n_channels, log_length=256, barometer=None):
         self.spec, self.model, self.code = spec, model, model_code(model)
         self.x, self.p = x, np.ascontiguousarray(p)
         n, m = p.shape[0], 2 * n_channels
-        self.rates, self.q = model_rates(model), extended_q(model, x)
+        self.rates, self.q = model_rates(model, barometer), extended_q(model, x)
         self.filter_s = getattr(model, "pitch_filter_s", 1.0)
         self.f, self.dx = np.zeros((n, n)), np.zeros(n)
         self.power, self.cn0 = np.zeros((n_channels, kernels.N_CN0)), np.full(n_channels, 1e4)

@@ -1,7 +1,7 @@
 """Compiled steps of the vector and ultra-tight receivers: predict, update from discriminators, steer.
 
-One filter for four error models (integer code): the two RISS forms, the 17-state strapdown model, and position, velocity,
-clock alone (``KINEMATIC``, the vector receiver). Every model has one more error state at its end, the inter-system bias.
+One filter for five error models (integer code): the two RISS forms, the 17-state strapdown model, the Pinson model with
+barometer, and position, velocity, clock alone (``KINEMATIC``, the vector receiver). Every model has one more error state at its end, the inter-system bias.
 The nominal state is a flat array ``x`` (N_X,) whose layout depends on the model; columns from ``ACC`` on are common.
 
 Innovation about the NCO. A discriminator sees e = g (true - NCO) + noise, g <= 1 its gain at this C/N0. With
@@ -13,9 +13,10 @@ import math
 import numpy as np
 from numba import njit
 
-from nav.errormodels import ecef17_f
-from nav.eskf_kernels import discretise, innovation_covariance, update
-from nav.frames import position_map_geodetic, rotation_enu_to_ecef
+from nav.errormodels import ecef17_f, pinson13_f
+from nav.eskf_kernels import discretise, innovation_covariance, joseph_scalar, update
+from nav.eskf_kernels import predict as predict_covariance
+from nav.frames import earth_radii, geodetic_from_ecef, position_map_geodetic, rotation_enu_to_ecef
 from nav.kernels import predict_ranges
 from nav.riss import (
     AZIMUTH,
@@ -46,8 +47,11 @@ from signals.constants import C_MPS, CHIP_RATE_HZ, EARTH_RATE_RAD_S, F_L1_HZ, ME
 from signals.geometry_kernels import orbit_kernel
 from tracking.lock import STATE_LOCKED
 
-ECEF17, KINEMATIC = 2, 3
+ECEF17, KINEMATIC, PINSON = 2, 3, 4
 """Model codes beside ``riss.PAPER`` and ``riss.SCALE``."""
+BARO_ERROR, WANDER, BARO_HEIGHT = 23, 24, 25
+"""Columns of the Pinson model, whose others are those of ``ECEF17``: error of the barometer (m), angle of the navigation frame
+about up, from east and north (rad), and the last height read (m, NaN: none)."""
 N_X, ACC, ISB = 32, 27, 30
 """Length of the nominal state; ECEF acceleration (3) of the last prediction; inter-system bias, m."""
 
@@ -71,8 +75,9 @@ TABLE_LOW_DB, TABLE_STEP_DB = -20.0, 0.5
 """Grid of the discriminator table: C/N0 T in dB; columns code gain, code variance (chips^2), frequency gain and
 variance of frequency x T / 2 (cycles^2)."""
 
-N_SENSOR = 7
-"""Sensor columns: gyro x y z rad/s, specific force x y z m/s^2 (forward, right, down), odometer m/s."""
+N_SENSOR = 8
+"""Sensor columns: gyro x y z rad/s, specific force x y z m/s^2 (forward, right, down), odometer m/s, barometer m (NaN: no
+reading in this interval)."""
 
 
 # ---------------------------------------------------------------------------------------------- the error models
@@ -87,6 +92,8 @@ def clock_states(model):
         return 7, 8
     if model == ECEF17:
         return 15, 16
+    if model == PINSON:
+        return 11, 12
     return 6, 7
 
 
@@ -95,7 +102,7 @@ def clock_columns(model):
     """Columns of clock bias and drift in the nominal state."""
     if model <= SCALE:
         return CLOCK_BIAS, CLOCK_DRIFT
-    if model == ECEF17:
+    if model == ECEF17 or model == PINSON:
         return 21, 22
     return 6, 7
 
@@ -132,10 +139,62 @@ def maps(model, x, tp, tv):
                 for j in range(3):
                     acc = r[i, 0] * v[0, j] + r[i, 1] * v[1, j] + r[i, 2] * v[2, j]
                     tv[i, 3 + j if j < 2 else 6] = acc
+    elif model == PINSON:
+        _pinson_maps(x, tp, tv)
     else:
         for i in range(3):
             tp[i, i] = 1.0
             tv[i, 3 + i] = 1.0
+
+
+@njit(cache=True, nogil=True)
+def _wander_frame(x):
+    """C_en (3, 3), ECEF to the Pinson model's navigation frame (east and north turned by the wander angle, up); height, m."""
+    lat, lon, height = geodetic_from_ecef(x[0:3])
+    r = rotation_enu_to_ecef(lat, lon)
+    c, s = math.cos(x[WANDER]), math.sin(x[WANDER])
+    c_en = np.empty((3, 3))
+    for j in range(3):
+        c_en[0, j] = c * r[j, 0] + s * r[j, 1]
+        c_en[1, j] = c * r[j, 1] - s * r[j, 0]
+        c_en[2, j] = r[j, 2]
+    return c_en, height
+
+
+@njit(cache=True, nogil=True)
+def _pinson_maps(x, tp, tv):
+    """T_p, T_v of the Pinson model: x = R_N dtheta_y, y = -R_M dtheta_x, z = dh; C_ne (dV - [v x] dtheta)."""
+    c_en, height = _wander_frame(x)
+    rm, rn = earth_radii(math.asin(min(1.0, max(-1.0, c_en[2, 2]))))
+    v = np.dot(c_en, x[3:6])
+    for i in range(3):
+        e, n, u = c_en[0, i], c_en[1, i], c_en[2, i]
+        tp[i, 0], tp[i, 1], tp[i, 9] = -(rm + height) * n, (rn + height) * e, u
+        tv[i, 0] = u * v[1] - n * v[2]
+        tv[i, 1] = e * v[2] - u * v[0]
+        tv[i, 2] = n * v[0] - e * v[1]
+        tv[i, 6], tv[i, 7], tv[i, 8] = e, n, u
+
+
+@njit(cache=True, nogil=True)
+def _inject_pinson(x, dx):
+    """Pinson's errors into the ECEF state: position and velocity by their maps, attitude by C_ne (dtheta - phi)."""
+    n = dx.size
+    tp, tv = np.zeros((3, n)), np.zeros((3, n))
+    _pinson_maps(x, tp, tv)
+    c_en, _ = _wander_frame(x)
+    psi = np.empty(3)
+    for i in range(3):
+        psi[i] = 0.0
+        for j in range(3):
+            psi[i] += c_en[j, i] * (dx[j] - dx[3 + j])
+    _turn(x[6:15], psi)
+    for i in range(3):
+        for j in range(n):
+            x[i] += tp[i, j] * dx[j]
+            x[3 + i] += tv[i, j] * dx[j]
+    x[WANDER] += dx[2]
+    x[BARO_ERROR] += dx[10]
 
 
 @njit(cache=True, nogil=True)
@@ -183,6 +242,8 @@ def inject(model, x, dx):
         x[VE] = v * math.cos(x[PITCH]) * math.sin(x[AZIMUTH])
         x[VN] = v * math.cos(x[PITCH]) * math.cos(x[AZIMUTH])
         x[VU] = v * math.sin(x[PITCH])
+    elif model == PINSON:
+        _inject_pinson(x, dx)
     else:
         for i in range(6):
             x[i] += dx[i]
@@ -199,7 +260,8 @@ def predict(model, x, p, sensors, dt_s, filter_s, rates, q_diag, f, phi, qd):
     Parameters
     ----------
     x (N_X,), p (n, n) : in place;  sensors (m, N_SENSOR);  dt_s : one sensor interval
-    filter_s : pitch low pass of RISS;  rates : 1 / correlation times of the model, 1/s;  q_diag (n,)
+    filter_s : pitch low pass of RISS;  q_diag (n,)
+    rates (3,) : 1 / correlation times of the model, 1/s; of PINSON the barometer's, its loop's gain 1/s, its variance m^2
     f, phi, qd (n, n) : work and outputs
     """
     m, n = sensors.shape[0], p.shape[0]
@@ -218,7 +280,10 @@ def predict(model, x, p, sensors, dt_s, filter_s, rates, q_diag, f, phi, qd):
         else:
             riss11_f(x, turn, rates[0], rates[1], f[: n - 1, : n - 1])
     elif model == ECEF17:
-        _strapdown_epoch(x, sensors, dt_s, rates, f)
+        middle, force = _strapdown_epoch(x, sensors, dt_s, rates)
+        ecef17_f(x[0:3], middle, force, rates[0], rates[1], f[: n - 1, : n - 1])
+    elif model == PINSON:
+        _pinson_epoch(x, sensors, dt_s, rates, f[: n - 1, : n - 1])
     else:
         for i in range(3):
             x[i] += x[3 + i] * span
@@ -226,22 +291,66 @@ def predict(model, x, p, sensors, dt_s, filter_s, rates, q_diag, f, phi, qd):
         x[6] += x[7] * span
         f[6, 7] = 1.0
     discretise(f, q_diag, span, phi, qd)
-    t = np.dot(phi, p)
-    for i in range(n):
-        for j in range(i, n):
-            acc = qd[i, j]
-            for k in range(n):
-                acc += t[i, k] * phi[j, k]
-            p[i, j] = acc
-            p[j, i] = acc
+    predict_covariance(p, phi, qd)
+    if model == PINSON:
+        _read_height(x, p, sensors, rates[2], phi, qd)
     position_velocity(model, x, pos, v1)
     for i in range(3):
         x[ACC + i] = (v1[i] - v0[i]) / span
 
 
 @njit(cache=True, nogil=True)
-def _strapdown_epoch(x, sensors, dt_s, rates, f):
-    """Strapdown navigation of the 17-state model over one epoch, and its F."""
+def _pinson_epoch(x, sensors, dt_s, rates, f):
+    """Strapdown navigation over one epoch with the height slaved to the barometer, h' = v_z + k (h_baro - error - h); its F."""
+    span = sensors.shape[0] * dt_s
+    middle, force = _strapdown_epoch(x, sensors, dt_s, np.zeros(2))
+    c_en, height = _wander_frame(x)
+    v = np.dot(c_en, x[3:6])
+    rm, rn = earth_radii(math.asin(c_en[2, 2]))
+    # The frame does not turn about up, where east and north do: alpha' = -v_east tan(lat) / R_N.
+    east = math.cos(x[WANDER]) * v[0] - math.sin(x[WANDER]) * v[1]
+    x[WANDER] -= span * east * c_en[2, 2] / math.sqrt(1.0 - c_en[2, 2] ** 2) / (rn + height)
+    if not math.isnan(x[BARO_HEIGHT]):
+        step = rates[1] * span * (x[BARO_HEIGHT] - x[BARO_ERROR] - height)
+        for i in range(3):
+            x[i] += step * c_en[2, i]
+    x[BARO_ERROR] *= math.exp(-rates[0] * span)
+    force_n = np.dot(c_en, np.dot(middle, force))
+    pinson13_f(c_en, (rm + height, rn + height), v, force_n, rates[0], rates[1], 1.0, -1.0, f)
+
+
+@njit(cache=True, nogil=True)
+def _read_height(x, p, sensors, var, phi, qd):
+    """Update by the epoch's last barometer reading, row [dh + dhB]; the epoch's Phi and Qd take it in.
+
+    With A = I - k h', what follows sees one transition A Phi with noise A Qd A' + k var k'.
+    """
+    height = math.nan
+    for k in range(sensors.shape[0]):
+        if not math.isnan(sensors[k, 7]):
+            height = sensors[k, 7]
+    if math.isnan(height):
+        return
+    n = p.shape[0]
+    row, g, gain, a = np.zeros(n), np.zeros(n), np.zeros(n), np.eye(n)
+    row[9] = row[10] = 1.0
+    joseph_scalar(p, row, var, g, gain)
+    _, here = _wander_frame(x)
+    inject(PINSON, x, gain * (height - here - x[BARO_ERROR]))
+    x[BARO_HEIGHT] = height
+    for i in range(n):
+        a[i, 9] -= gain[i]
+        a[i, 10] -= gain[i]
+    phi[:] = np.dot(a, phi)
+    qd[:] = np.dot(np.dot(a, qd), a.T)
+    for i in range(n):
+        for j in range(n):
+            qd[i, j] += gain[i] * var * gain[j]
+
+
+@njit(cache=True, nogil=True)
+def _strapdown_epoch(x, sensors, dt_s, rates):
+    """Strapdown navigation in ECEF over one epoch; returns C_be (3, 3) in its middle and the mean specific force (3,)."""
     m = sensors.shape[0]
     pos, vel = x[0:3].copy(), x[3:6].copy()
     c = x[6:15].copy().reshape(3, 3)
@@ -254,8 +363,6 @@ def _strapdown_epoch(x, sensors, dt_s, rates, f):
             g[i], a[i] = sensors[k, i] - x[18 + i], sensors[k, 3 + i] - x[15 + i]
             force[i] += a[i] / m
         strapdown_step(pos, vel, c, g, a, dt_s)
-    n = f.shape[0] - 1
-    ecef17_f(pos, middle, force, rates[0], rates[1], f[:n, :n])
     x[0:3], x[3:6] = pos, vel
     x[6:15] = c.reshape(9)
     span = m * dt_s
@@ -263,6 +370,7 @@ def _strapdown_epoch(x, sensors, dt_s, rates, f):
         x[15 + i] *= math.exp(-rates[0] * span)
         x[18 + i] *= math.exp(-rates[1] * span)
     x[21] += x[22] * span
+    return middle, force
 
 
 # --------------------------------------------------------------------------------------------- powers and variance

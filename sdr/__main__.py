@@ -102,6 +102,7 @@ def receive(
     scenario: Annotated[str | None, Parameter(help="Scenario whose [receiver] section is used.")] = None,
     imu: Annotated[Path | None, Parameter(help="CSV of an IMU, aligned to the first sample.")] = None,
     odometer: Annotated[Path | None, Parameter(help="CSV of an odometer.")] = None,
+    barometer: Annotated[Path | None, Parameter(help="CSV of a barometer.")] = None,
     output: Out = None,
     plots: Annotated[bool, Parameter(negative="", help="Draw the figures beside the results.")] = False,
     json: Json = False,
@@ -122,6 +123,7 @@ def receive(
         quiet=json,
         imu=imu,
         odometer=odometer,
+        barometer=barometer,
     )
     _report("receive", result, json)
 

@@ -1,6 +1,7 @@
 """The jobs behind the commands: run, simulate, receive, acquire. Each returns the command's JSON object."""
 
 import contextlib
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -8,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from nav.sensor_files import write_imu, write_odometer
+from nav.sensor_files import write_barometer, write_imu, write_odometer
 from nav.steering import Sensors
 from sdr import iffile, scenario
 from sdr.modes import SideBySide, table
@@ -17,6 +18,7 @@ from sdr.receiver import Outcome, Receiver
 from sdr.scenario import ReceiverSpec, Scenario
 from sdr.spectrum import EVERY_S, Watched
 from sdr.store import Store
+from sdr.watch_post import report_lines, totals
 from signals.geodesy import ecef_to_geodetic
 from signals.modulation import SIGNALS
 from tracking.acquisition import AcquisitionSpec, slab_samples
@@ -66,13 +68,14 @@ def receive(
     quiet: bool = False,
     imu: Path | None = None,
     odometer: Path | None = None,
+    barometer: Path | None = None,
 ) -> dict[str, Any]:
     """Receive a recording with the receiver of scenario ``name`` (default: the default receiver)."""
     spec, text = _receiver(name, overrides, threads)
     source = iffile.open_recording(file, iffile.declaration(file, recording))
     path = Path(output) if output else Path.cwd() / (Path(file).stem + ".results.h5")
     with Store(path, command="receive", scenario=text, seed=None) as store:
-        sensors = scenario.read_sensors(name, overrides, imu, odometer, source)
+        sensors = scenario.read_sensors(name, overrides, imu, odometer, barometer, source)
         result = _receive(spec, source, store, Path(file).name, quiet, sensors)
     return _finish(result, path, plots)
 
@@ -124,17 +127,21 @@ def simulate(
 
 
 def _write_sensors(spec: Scenario, base: Path) -> list[str]:
-    """The scenario's IMU and odometer as CSV beside its recording."""
+    """The scenario's IMU, odometer and barometer as CSV beside its recording."""
     sensors = scenario.sensors(spec)
     if sensors is None:
         return []
-    imu = base.with_name(base.name + ".imu.csv")
-    write_imu(imu, sensors.imu)
-    if sensors.odometer is None:
-        return [str(imu)]
-    odometer = base.with_name(base.name + ".odo.csv")
-    write_odometer(odometer, sensors.odometer)
-    return [str(imu), str(odometer)]
+    parts: list[tuple[str, Any, Any]] = [
+        (".imu.csv", write_imu, sensors.imu),
+        (".odo.csv", write_odometer, sensors.odometer),
+        (".baro.csv", write_barometer, sensors.barometer),
+    ]
+    files = []
+    for suffix, write, rows in parts:
+        if rows is not None:
+            files.append(base.with_name(base.name + suffix))
+            write(files[-1], rows)
+    return [str(f) for f in files]
 
 
 def acquire(
@@ -253,9 +260,10 @@ def _receive(
         "duration_s": duration_s,
         "real_time_factor": duration_s / (time.perf_counter() - begin),
         "satellites": receiver.satellites(tally.locked_s),
-        "monitors": _monitors(receiver),
+        "monitors": _monitors(receiver, source),
         "protection": tally.stanford(source, receiver),
     }
+    result["monitor_totals"] = totals(result["monitors"])
     if side:
         side.store(store)
         result["modes"] = side.modes()
@@ -354,27 +362,22 @@ def _store_theory(store: Store, receiver: Receiver) -> None:
 
 
 def _store_alarms(store: Store, receiver: Receiver) -> None:
-    """What waits in the monitors, their thresholds and their alarms."""
+    """What waits in the monitors, their thresholds and their alarms, and when they could not watch."""
     for monitor in receiver.monitors:
-        for rows in monitor.flush():
+        for rows in monitor.flush(receiver.position):
             store.append(f"monitors/{monitor.spec.name}", rows)
-        store.append("monitors/thresholds", monitor.watched())
-        for rows in monitor.alarms().values():
-            store.append("monitors/alarms", rows)
+        for post in monitor.posts:
+            store.append("monitors/thresholds", post.watched())
+            store.append("monitors/alarms", post.alarms())
+            store.append("monitors/unwatched", post.unwatched())
 
 
-def _monitors(receiver: Receiver) -> list[dict[str, Any]]:
-    """One row per monitor and channel: threshold, number of tests, alarms."""
-    out = []
-    for monitor in receiver.monitors:
-        alarms = monitor.alarms()
-        for row in monitor.watched():
-            key = row["signal"].decode(), int(row["prn"])
-            numbers = {k: float(row[k]) for k in ("threshold", "p_fa", "trained_s")}
-            found = [{k: float(a[k]) for k in ("start_s", "end_s", "peak")} for a in alarms[key]]
-            head = {"name": monitor.spec.name, "signal": key[0], "prn": key[1]}
-            out.append(head | numbers | {"tests": int(row["tests"]), "alarms": found})
-    return out + ([] if receiver.integrity is None else receiver.integrity.report())
+def _monitors(receiver: Receiver, source: Any) -> list[dict[str, Any]]:
+    """One row per monitor and channel: threshold, number of tests, alarms; false ones where the jammers are known."""
+    starts = [j.n_on / receiver.fs_hz for j in getattr(source, "jammers", ()) if hasattr(j, "n_on")]
+    quiet_until_s = min(starts, default=math.inf)
+    rows = [row for monitor in receiver.monitors for row in monitor.report(quiet_until_s)]
+    return rows + ([] if receiver.integrity is None else receiver.integrity.report())
 
 
 def _fix(receiver: Receiver, source: Any, tally: _Tally) -> dict[str, Any] | None:
@@ -449,11 +452,7 @@ def _summary(result: dict[str, Any]) -> str:
             f"position {fix['lat_deg']:.7f} deg, {fix['lon_deg']:.7f} deg, {fix['height_m']:.2f} m: {fix['epochs']} fixes "
             f"from {fix['first_s']:.1f} s on with {len(fix['used'])} satellites{error}"
         )
-    for m in result["monitors"]:
-        first = f", the first at {m['alarms'][0]['start_s']:.1f} s" if m["alarms"] else ""
-        rows.append(
-            f"{m['name']} on {m['signal']} {m['prn']}: {len(m['alarms'])} alarms in {m['tests']} tests{first}"
-        )
+    rows += report_lines(result["monitors"], result["monitor_totals"])
     if result.get("modes"):
         rows += table(result["modes"])
     rows.append(f"results in {result['output']}")

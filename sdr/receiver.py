@@ -18,7 +18,8 @@ from nav.navlog import Remedy
 from nav.records import SOLUTION
 from nav.steering import Sensors, Steering
 from sdr.scenario import ReceiverSpec
-from sdr.watch import Flags
+from sdr.watch import Flags, Watch
+from sdr.watch_front import FrontWatch, Overheard
 from signals.modulation import SIGNALS
 from tracking.acquisition import acquire, slab_samples
 from tracking.channel import STATE_IDLE, STATE_LOCKED, STATE_LOST
@@ -32,7 +33,7 @@ ENOUGH = 4
 SOLUTION_EVERY = 5
 """Steered positions are reported every so many navigation epochs."""
 DECODE_EVERY = 10
-"""Slabs whose symbols are decoded together while the channels are steered."""
+"""Most slabs whose symbols are decoded together; at navigation epochs all are."""
 TAKE_EVERY = 25
 """New channels are put under command every so many navigation epochs."""
 WIDEST = 4.0
@@ -79,15 +80,16 @@ class Receiver:
 
     def __init__(self, spec: ReceiverSpec, source: Source, sensors: Sensors | None = None) -> None:
         self.spec = spec
-        self.mitigation = spec.mitigation.start(source) if spec.mitigation else None
-        self.source = self.mitigation or source
+        self.monitors = [m.start(source.fs_hz) for m in spec.monitor]
+        self.front = Overheard(source, [m for m in self.monitors if isinstance(m, FrontWatch)])
+        self.mitigation = spec.mitigation.start(self.front) if spec.mitigation else None
+        self.source = self.mitigation or self.front
         self.fs_hz = float(source.fs_hz)
         self.tracker = spec.tracking.start(source.fs_hz, source.if_hz, spec.codes_path)
         self.telemetry = Telemetry(self.tracker)
         self.navigator = spec.navigation.start(source.fs_hz)
         self.steering = self._start_steering(sensors)
         self._aiding: np.ndarray | None = None
-        self.monitors = [m.start(source.fs_hz) for m in spec.monitor]
         respond = spec.respond
         self.flags = Flags(respond.weaken, respond.weaken_by, respond.hold_s, self.fs_hz)
         self.integrity = spec.integrity.start(spec.respond, self.fs_hz) if spec.integrity else None
@@ -98,7 +100,7 @@ class Receiver:
         self._search_spec = spec.acquisition
         self.position = 0
         self._week: int | None = None
-        self._held: list[tuple[np.ndarray, np.ndarray]] = []
+        self._undecoded = 0
         self._recent: list[tuple[int, np.ndarray]] = []
         self._lost: list[tuple[str, int]] = []
         self._next_search = self._next_retry = self._full_searches = self._turn = 0
@@ -131,7 +133,10 @@ class Receiver:
         # Searching comes first: a new channel starts with this slab, so that nothing of a short file is lost.
         found = self._search(n0, iq)
         epochs, counts, corr = self.tracker.process(n0, iq, self._commands())
-        self._decode()
+        self.telemetry.hear()
+        self._undecoded += 1
+        if navigate or self._undecoded >= DECODE_EVERY or n_end >= self.source.n_samples:
+            self._decode()
         self.position = n_end
         rows = [(c, epochs[c, :n], corr[c, :n]) for c, n in enumerate(counts) if n]
         out = Outcome(n0, n_end, found, rows)
@@ -168,7 +173,8 @@ class Receiver:
         self._recent.append((n0, iq))
         if sum(s.shape[1] for _, s in self._recent) < self._wanted and n_end < self.source.n_samples:
             return np.empty(0, ACQUISITION)
-        first, samples = self._recent[0][0], np.concatenate([s for _, s in self._recent], axis=1)
+        first, samples = self._recent[0][0], np.concatenate([s[:, : self._wanted] for _, s in self._recent], axis=1)
+        samples = samples[:, : self._wanted]
         self._recent.clear()
         self._next_retry = n_end + round(RETRY_S * self.fs_hz)
         return self._acquire(first, samples, self._due(n_end))
@@ -217,7 +223,7 @@ class Receiver:
                 samples, first, self.fs_hz, self.source.if_hz, signal, prns, spec, self.spec.codes_path
             )
             for row in rows[rows["acquired"]]:
-                self._decode(at_once=True)  # before a channel changes hands
+                self._decode()  # before a channel changes hands
                 c = self.tracker.add(row)
                 self.channel_of[signal, int(row["prn"])] = c
                 self.telemetry.start(c)
@@ -274,26 +280,9 @@ class Receiver:
         """Whether a filter steers the channels now."""
         return self.steering is not None and self.steering.filter is not None
 
-    def _decode(self, at_once: bool = False) -> None:
-        """Feed the decoders; while steered, whose slabs are short, a few slabs at a time."""
-        tracker = self.tracker
-        if not self._held and not self._steered:
-            if not at_once:
-                self.telemetry.update()
-            return
-        if not at_once:
-            self._held.append((tracker.symbols, tracker.symbol_counts))
-        if len(self._held) >= DECODE_EVERY or (at_once and self._held):
-            counts: Any = sum(n for _, n in self._held)  # array (channels,)
-            merged = np.zeros((len(counts), int(counts.max())), tracker.symbols.dtype)
-            at = np.zeros(len(counts), np.int64)
-            for symbols, n in self._held:
-                for c in np.flatnonzero(n):
-                    merged[c, at[c] : at[c] + n[c]] = symbols[c, : n[c]]
-                at += n
-            self._held.clear()
-            tracker.symbols, tracker.symbol_counts = merged, counts
-            self.telemetry.update()
+    def _decode(self) -> None:
+        self.telemetry.decode()
+        self._undecoded = 0
 
     # -- steering: the hand-over back to tracking, one slab later -----------------------------------------------------
 
@@ -336,6 +325,7 @@ class Receiver:
         if self._week is not None and steering.filter.epochs % SOLUTION_EVERY == 0:
             out.solutions.append(steering.solution(self._week))
         if steering.filter.epochs % TAKE_EVERY == 0:
+            steering.meet(self.navigator.handover()[2])
             steering.take(self._phase_locked(), self.telemetry.ephemerides())
 
     def _hand_over(self, sample: int, out: Outcome) -> None:
@@ -380,15 +370,13 @@ class Receiver:
 
     def _watch(self, out: Outcome) -> None:
         """Let every monitor see the windows of taps; what comes back are flags, for the next epoch."""
+        out.statistics += self.front.take()
+        watches = [m for m in self.monitors if isinstance(m, Watch)]
         channels = self.tracker.channels
-        for monitor in self.monitors:
-            for c, epochs, corr in out.epochs:
-                signal, prn, k = (
-                    channels["signal"][c].decode(),
-                    int(channels["prn"][c]),
-                    self.tracker.window(c),
-                )
-                taps = self._nominal_taps(signal), self.tracker.taps_chips(c)[:k]
+        for c, epochs, corr in out.epochs if watches else ():
+            signal, prn, k = channels["signal"][c].decode(), int(channels["prn"][c]), self.tracker.window(c)
+            taps = self._nominal_taps(signal), self.tracker.taps_chips(c)[:k]
+            for monitor in watches:
                 rows = monitor(signal, prn, epochs, corr[:, :k], taps, self.waveform(signal))
                 if len(rows):
                     self.flags.note(monitor, rows)

@@ -14,9 +14,16 @@ from typing import Annotated, Any, TypeVar
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from nav.imu import ImuSpec, OdometerSpec, simulate_imu, simulate_odometer
+from nav.imu import (
+    BarometerSpec,
+    ImuSpec,
+    OdometerSpec,
+    simulate_barometer,
+    simulate_imu,
+    simulate_odometer,
+)
 from nav.navigator import NavigationSpec
-from nav.sensor_files import read_imu, read_odometer
+from nav.sensor_files import read_barometer, read_imu, read_odometer
 from nav.steering import Sensors
 from nav.ultratight import SteeringSpec
 from sdr.integrity import IntegritySpec
@@ -94,6 +101,7 @@ class SensorsSpec(BaseModel):
 
     imu: ImuSpec = ImuSpec()
     odometer: OdometerSpec | None = None
+    barometer: BarometerSpec | None = None
 
 
 class Scenario(BaseModel):
@@ -147,27 +155,46 @@ def sensors(spec: Scenario) -> Sensors | None:
     imu = simulate_imu(motion, spec.sensors.imu, _child(spec, SENSORS, 0), span_s, fs_hz)[0]
     odometer = None
     if spec.sensors.odometer is not None:
-        odometer = simulate_odometer(motion, spec.sensors.odometer, _child(spec, SENSORS, 1), span_s, fs_hz)[
-            0
-        ]
-    return Sensors(spec.sensors.imu, spec.sensors.odometer, imu, odometer)
+        odometer, _ = simulate_odometer(
+            motion, spec.sensors.odometer, _child(spec, SENSORS, 1), span_s, fs_hz
+        )
+    barometer = None
+    if spec.sensors.barometer is not None:
+        barometer, _ = simulate_barometer(
+            motion, spec.sensors.barometer, _child(spec, SENSORS, 2), span_s, fs_hz
+        )
+    return Sensors(spec.sensors.imu, spec.sensors.odometer, imu, odometer, spec.sensors.barometer, barometer)
 
 
 def read_sensors(
-    name: str | None, overrides: Sequence[str], imu: Path | None, odometer: Path | None, source: Any
+    name: str | None,
+    overrides: Sequence[str],
+    imu: Path | None,
+    odometer: Path | None,
+    barometer: Path | None,
+    source: Any,
 ) -> Sensors | None:
     """Recorded sensors of a recording; their noise is that of the scenario's ``[sensors]``, or the default grades."""
     if imu is None:
         if odometer is not None:
             raise ValueError("--odometer needs --imu as well: the reduced system takes its turns from a gyro")
+        if barometer is not None:
+            raise ValueError("--barometer needs --imu as well: it carries the height of an inertial system")
         return None
     spec = load(name, overrides)[0].sensors if name is not None else None
     spec = spec or SensorsSpec()
     duration_s = source.n_samples / source.fs_hz
     rows = read_imu(imu, source.fs_hz, duration_s)
     speeds = None if odometer is None else read_odometer(odometer, source.fs_hz, duration_s)
-    odometer_spec = spec.odometer if speeds is None else spec.odometer or OdometerSpec()
-    return Sensors(spec.imu, odometer_spec if speeds is not None else None, rows, speeds)
+    heights = None if barometer is None else read_barometer(barometer, source.fs_hz, duration_s)
+    return Sensors(
+        spec.imu,
+        None if speeds is None else spec.odometer or OdometerSpec(),
+        rows,
+        speeds,
+        None if heights is None else spec.barometer or BarometerSpec(),
+        heights,
+    )
 
 
 def jammers(spec: Scenario, fs_hz: float, if_hz: float, is_complex: bool, sky: Sky | None) -> list[JammerRun]:

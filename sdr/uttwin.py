@@ -12,7 +12,14 @@ import numpy as np
 
 from nav import ultratight_kernels as ut
 from nav.frames import geodetic_from_ecef, rotation_enu_to_ecef
-from nav.imu import ImuSpec, OdometerSpec, simulate_imu, simulate_odometer
+from nav.imu import (
+    BarometerSpec,
+    ImuSpec,
+    OdometerSpec,
+    simulate_barometer,
+    simulate_imu,
+    simulate_odometer,
+)
 from nav.kernels import predict_ranges
 from nav.ultratight import (
     SteeringSpec,
@@ -135,6 +142,7 @@ class Trial:
     spacing_chips: float = 1.0
     imu: ImuSpec = field(default_factory=lambda: ImuSpec(grade="karaim2020"))
     odometer: OdometerSpec = field(default_factory=OdometerSpec)
+    barometer: BarometerSpec | None = None
     clock_s_f: float = 0.009
     clock_s_g: float = 0.035
     fll_hz: float = 4.0
@@ -146,7 +154,7 @@ def run(
 ) -> np.ndarray:
     """One trial -> (epochs / EVERY, N_OUT), see ``uttwin_kernels.N_OUT``; ``seed`` (int or SeedSequence) alone decides."""
     seq = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
-    children = [np.random.SeedSequence(seq.entropy, spawn_key=(*seq.spawn_key, i)) for i in range(5)]
+    children = [np.random.SeedSequence(seq.entropy, spawn_key=(*seq.spawn_key, i)) for i in range(6)]
     noise, start = (np.random.Generator(np.random.Philox(children[i])) for i in (0, 1))
     bias, drift = _clock(trial, sky.n_epochs, children[2])
     out = np.zeros((sky.n_epochs // EVERY, N_OUT))
@@ -168,13 +176,13 @@ def run(
             cn0, jam, q_rc, amplitude, gains, 10**2.2, 1.0, guarded, sky.r_le, EVERY, watch, out,
         )  # fmt: skip
         return out
-    model = build_model(spec, trial.imu, trial.odometer)
-    sensors, per_epoch = _sensors(sky, trial, children[3], children[4])
+    model = build_model(spec, trial.imu, trial.odometer, trial.barometer)
+    sensors, per_epoch = _sensors(sky, trial, *children[3:])
     x, p = _start(sky, trial, model, start, bias[0], drift[0])
     table = discriminator_table("L1CA", trial.spacing_chips)[None]
     aided_run(
         noise, model_code(model), x, p, sensors, per_epoch, T_S / per_epoch, getattr(model, "pitch_filter_s", 1.0),
-        model_rates(model), extended_q(model, x), spec.limit_sigma, policy.fast_s, policy.slow_s, spec.code_floor_m,
+        model_rates(model, trial.barometer), extended_q(model, x), spec.limit_sigma, policy.fast_s, policy.slow_s, spec.code_floor_m,
         spec.rate_floor_mps, table, policy.sign, 10 ** (policy.fixed_dbhz / 10) if policy.fixed_dbhz > 0 else 0.0,
         policy.use_gain, 10 ** (policy.skip_below_dbhz / 10) if policy.skip_below_dbhz > 0 else 0.0, T_S, half, sky.sat_pos,
         sky.sat_vel, sky.sat_acc, sky.rho, sky.rate, sky.pos, sky.vel, bias, drift, cn0, jam, q_rc, amplitude, sky.r_le,
@@ -194,7 +202,7 @@ def _clock(trial, n_epochs, seed):
     return 100.0 + np.concatenate([[0.0], np.cumsum(step)]), drift
 
 
-def _sensors(sky, trial, imu_seed, odometer_seed):
+def _sensors(sky, trial, imu_seed, odometer_seed, barometer_seed):
     """Sensor rows (m, N_SENSOR) and their number per epoch."""
     per_epoch = trial.imu.rate_hz * T_S
     if abs(per_epoch - round(per_epoch)) > 1e-9 or trial.odometer.rate_hz != trial.imu.rate_hz:
@@ -202,7 +210,12 @@ def _sensors(sky, trial, imu_seed, odometer_seed):
     span = sky.n_epochs * T_S
     imu = simulate_imu(sky.motion, trial.imu, imu_seed, span)[0]
     odometer = simulate_odometer(sky.motion, trial.odometer, odometer_seed, span)[0]
-    return np.column_stack([imu["gyro_rad_s"], imu["accel_mps2"], odometer["speed_mps"]]), round(per_epoch)
+    height = np.full(imu.size, np.nan)
+    if trial.barometer is not None:
+        rows = simulate_barometer(sky.motion, trial.barometer, barometer_seed, span)[0]
+        height[np.searchsorted(imu["t_s"], rows["t_s"] - 1e-6)] = rows["height_m"]
+    columns = imu["gyro_rad_s"], imu["accel_mps2"], odometer["speed_mps"], height
+    return np.column_stack(columns), round(per_epoch)
 
 
 def _start(sky, trial, model, rng, bias_m, drift_mps):

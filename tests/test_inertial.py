@@ -7,9 +7,11 @@ from nav import frames, sensor_files, strapdown
 from nav.imu import (
     DEG_H,
     GRADES,
+    BarometerSpec,
     ImuSpec,
     OdometerSpec,
     gauss_markov,
+    simulate_barometer,
     simulate_imu,
     simulate_odometer,
     true_attitude,
@@ -239,8 +241,20 @@ def test_odometer_scale_and_noise():
     assert 0 < np.abs(scale).max() < Z * 0.01
 
 
+def test_barometer_bias_and_noise():
+    motion, spec = weave(), BarometerSpec(rate_hz=50.0, bias_sigma_m=4.0, bias_tau_s=20.0, noise_m=0.2)
+    rows, bias = simulate_barometer(motion, spec, 4, 60.0)
+    true = np.array([frames.geodetic_from_ecef(p)[2] for p in motion(rows["t_s"]).pos_ecef_m])
+    assert np.std(rows["height_m"] - true - bias) == pytest.approx(0.2, rel=Z / np.sqrt(2 * rows.size))
+    ends = np.array([simulate_barometer(motion, spec, seed, 1.0)[1][-1] for seed in range(200)])
+    assert np.std(ends) == pytest.approx(4.0, rel=Z / np.sqrt(2 * ends.size))
+
+
 def test_files_round_trip_and_align_to_samples(tmp_path):
     motion = weave()
+    baro = simulate_barometer(motion, BarometerSpec(), 1, 5.0, 4e6)[0]
+    sensor_files.write_barometer(tmp_path / "baro.csv", baro)
+    assert sensor_files.read_barometer(tmp_path / "baro.csv", 4e6, 5.0).tobytes() == baro.tobytes()
     imu, odo = (
         simulate_imu(motion, ImuSpec(), 1, 5.0, 4e6)[0],
         simulate_odometer(motion, OdometerSpec(), 1, 5.0, 4e6)[0],
@@ -311,6 +325,9 @@ def test_files_that_are_no_tables_are_refused(tmp_path):
     path.write_text("t_s,speed_mps\n0.1,fast\n")
     with pytest.raises(ValueError, match="fast"):
         sensor_files.read_odometer(path, 4e6)
+    path.write_text("t_s,height_m\n0.1,1013.2\n0.2,101325\n0.3,101325\n")
+    with pytest.raises(ValueError, match="not a pressure"):
+        sensor_files.read_barometer(path, 4e6)
     path.write_text("t_s,speed_mps\n")
     with pytest.raises(ValueError, match="no data"):
         sensor_files.read_odometer(path, 4e6)

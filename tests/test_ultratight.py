@@ -5,8 +5,9 @@ import pytest
 
 from nav import ultratight as ut
 from nav import ultratight_kernels as kernels
-from nav.errormodels import Ecef17
-from nav.imu import ImuSpec, OdometerSpec
+from nav.errormodels import Ecef17, Pinson13, measurement_rows, pinson_state
+from nav.frames import geodetic_from_ecef
+from nav.imu import BarometerSpec, ImuSpec, OdometerSpec
 from nav.navlog import REMEDY, Remedy
 from nav.riss import Riss11, RissSf
 from nav.steering import LEFT_OUT, Sensors, Steering
@@ -21,7 +22,7 @@ from tracking.records import EPOCH
 T_S = 0.02
 POS = np.array([1_070_000.0, -4_450_000.0, 4_428_000.0])
 VEL = np.array([6.0, 5.0, 4.0])
-MODELS = [RissSf(), Riss11(velocity_noise_mps2_rthz=0.05), Ecef17(), Kinematic()]
+MODELS = [RissSf(), Riss11(velocity_noise_mps2_rthz=0.05), Ecef17(), Pinson13(), Kinematic()]
 
 
 @pytest.fixture(scope="module")
@@ -130,6 +131,79 @@ def test_prediction_is_that_of_the_riss_spec(model):
     assert p[:-1, :-1] == pytest.approx(q, rel=1e-9, abs=1e-18)
 
 
+def _pinson(wander_rad=0.3):
+    x = _nominal(Pinson13())
+    x[kernels.WANDER], x[kernels.BARO_ERROR] = wander_rad, 2.0
+    return x
+
+
+def test_pinson_rows_are_those_of_the_spec():
+    # The Spec carries C_en, the kernel ECEF and a wander angle: turned by it, both see the same rows.
+    x, model, n = _pinson(0.0), Pinson13(), 14
+    lat, lon, height = geodetic_from_ecef(POS)
+    enu = kernels._wander_frame(x)[0] @ VEL
+    los = np.array([[0.6, 0.0, 0.8], [0.0, -0.6, 0.8]])
+    tp, tv, h = np.empty((3, n)), np.empty((3, n)), np.zeros((4, n))
+    kernels.rows(kernels.PINSON, x, n, los, np.zeros(2), np.ones(2), np.ones(2), tp, tv, h)
+    state = pinson_state(lat, lon, height, enu)
+    assert h[:2, :13] == pytest.approx(measurement_rows(model, state, los), rel=1e-9, abs=1e-6)
+    assert h[2:, :13] == pytest.approx(measurement_rows(model, state, los, rate=True), rel=1e-9, abs=1e-6)
+
+
+def test_pinson_transition_is_the_derivative_of_its_mechanisation():
+    # 2 s of a turn with a rough IMU: errors injected before come out as Phi says, wander, height loop and all.
+    model, n, m, dt = Pinson13(), 14, 200, 0.01
+    code, rates = kernels.PINSON, ut.model_rates(model, BarometerSpec())
+    sensors = np.tile([0.001, 0.0, 0.05, 0.1, 0.5, -9.8, 0.0, np.nan], (m, 1))
+    q, f = np.zeros(n), np.zeros((n, n))
+    height = geodetic_from_ecef(POS)[2]
+
+    def after(dx):
+        x, p = _pinson(), np.zeros((n, n))
+        x[kernels.BARO_HEIGHT] = height + 7.0
+        kernels.inject(code, x, dx)
+        phi, qd, total = np.zeros((n, n)), np.zeros((n, n)), np.eye(n)
+        for k in range(m // 2):  # epochs of 20 ms
+            kernels.predict(code, x, p, sensors[2 * k : 2 * k + 2], dt, 1.0, rates, q, f, phi, qd)
+            total = phi @ total
+        return x, total
+
+    size = np.r_[1e-6, 1e-6, 1e-6, np.full(3, 1e-4), np.full(3, 0.1), 1.0, 1.0, 1.0, 1.0, 1.0]
+    _, total = after(np.zeros(n))
+    for j in range(n):
+        dx = np.zeros(n)
+        dx[j] = size[j]
+        (plus, _), (minus, _) = after(dx), after(-dx)
+        # The error that, injected into the one state, gives the other: position, velocity, attitude, clock, barometer.
+        low, high = minus.copy(), minus.copy()
+        kernels.inject(code, high, 2.0 * total[:, j] * size[j])
+        moved = high - low
+        scale = np.r_[np.full(3, 0.05), np.full(3, 0.01), np.full(9, 2e-5)]
+        assert np.all(
+            np.abs((plus - minus)[:15] - moved[:15]) < np.maximum(0.01 * np.abs(moved[:15]).max(), scale)
+        ), j
+        for column in (kernels.BARO_ERROR, 21, 22, kernels.ISB):
+            assert (plus - minus)[column] == pytest.approx(moved[column], rel=1e-3, abs=1e-9)
+
+
+def test_a_height_moves_the_state_as_the_barometer_row_says_and_shows_in_the_transition():
+    model, n = Pinson13(), 14
+    x, rates = _pinson(), ut.model_rates(model, BarometerSpec())
+    p = np.diag(np.r_[np.full(3, 1e-12), np.full(3, 1e-6), np.full(3, 0.01), 4.0, 12.0, 1.0, 1.0, 1.0])
+    before, height = x.copy(), geodetic_from_ecef(POS)[2]
+    phi, qd = np.eye(n), np.zeros((n, n))
+    sensors = np.full((2, kernels.N_SENSOR), np.nan)
+    sensors[0, 7] = height + 2.0 + 8.0  # the barometer's error of 2 m is known
+    kernels._read_height(x, p, sensors, rates[2], phi, qd)
+    s = 4.0 + 12.0 + rates[2]
+    assert geodetic_from_ecef(x[:3])[2] - height == pytest.approx(8.0 * 4.0 / s, abs=1e-6)
+    assert x[kernels.BARO_ERROR] - before[kernels.BARO_ERROR] == pytest.approx(8.0 * 12.0 / s)
+    assert p[9, 9] == pytest.approx(4.0 - 16.0 / s)
+    # A Phi P Phi' A' + k var k' is the same covariance: what monitors read is one linear step.
+    prior = np.diag(np.r_[np.full(3, 1e-12), np.full(3, 1e-6), np.full(3, 0.01), 4.0, 12.0, 1.0, 1.0, 1.0])
+    assert phi @ prior @ phi.T + qd == pytest.approx(p, abs=1e-12)
+
+
 @pytest.mark.parametrize("period_s", [1e-3, 4e-3])
 def test_nco_state_is_the_point_of_linearisation(period_s):
     # An NCO 3 m and 0.4 m/s above the prediction, discriminators that see the signal 5 m and 0.1 m/s above the NCO.
@@ -201,11 +275,14 @@ def _nees(sky, trial, model, n_runs, at_s):
     return out[:, rows, 8], out[:, 200:, 9] / out[:, 200:, 10]
 
 
-@pytest.mark.parametrize("model", ["riss_sf", "ecef17"])
-@pytest.mark.parametrize("js_db", [0.0, 35.0])
+@pytest.mark.parametrize("model", ["riss_sf", "ecef17", "pinson13"])
+@pytest.mark.parametrize("js_db", [0.0, 35.0, 55.0])
 def test_errors_and_innovations_are_as_large_as_claimed(sky, model, js_db):
     n = 16
-    nees, ratio = _nees(sky, Trial(js_db=js_db, jam_s=(25.0, 70.0)), model, n, (35.0, 68.0))
+    # Pinson's model has no states for sensor biases: it is one for navigation grade.
+    imu = ImuSpec(grade="navigation" if model == "pinson13" else "karaim2020")
+    trial = Trial(js_db=js_db, jam_s=(25.0, 70.0), imu=imu, barometer=BarometerSpec())
+    nees, ratio = _nees(sky, trial, model, n, (35.0, 68.0))
     # 5 dof each; two instants 33 s apart count as one sample, the smaller the number of freedoms the wider the bound.
     sd = np.sqrt(2 * 5 / n)
     assert abs(nees.mean() - 5.0) < 5 * sd, f"NEES {nees.mean():.2f} of 5"
