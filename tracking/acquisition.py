@@ -206,12 +206,17 @@ def _without_tones(x, share=0.003):
     """
     n = fast_length(x.shape[1])
     source, spectrum, run = row_fft(n)
-    source[:] = x[0, :n] + 1j * x[1, :n]
+    source.real, source.imag = x[:, :n]
     run()
-    power = np.abs(spectrum) ** 2
     width = max(256, n // 512)
-    local = np.median(power[: n // width * width].reshape(-1, width), axis=1) / math.log(2)
-    lines = np.flatnonzero(power > 16 * np.append(np.repeat(local, width), np.full(n % width, local[-1])))
+    power, suspects = np.empty(n, np.float32), np.empty(n // width, np.bool_)
+    kernels.spectral_power(spectrum, width, 16 / math.log(2), power, suspects)
+    found = [np.empty(0, np.int64)]
+    for r in np.flatnonzero(suspects):
+        median = np.median(power[r * width : (r + 1) * width])
+        end = (r + 1) * width if r < len(suspects) - 1 else n
+        found.append(r * width + np.flatnonzero(power[r * width : end] > 16 / math.log(2) * median))
+    lines = np.concatenate(found)
     if len(lines) == 0 or len(lines) > share * n:
         return x
     back, tones, run = row_fft(n, inverse=True)

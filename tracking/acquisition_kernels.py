@@ -75,6 +75,27 @@ def row_peak(acc, guard):
     return peak, at, mean, np.sqrt(max((square - near_square) / count - mean * mean, 0.0))
 
 
+@nb.njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz", "nnan"})
+def spectral_power(spectrum, width, ratio, power, suspects):
+    """power = |spectrum|^2; suspects[r]: the highest of bins r width .. (r + 1) width - 1 exceeds ``ratio`` times their median.
+
+    It does where more than half of the bins stay below the highest / ratio: no bin needs sorting. What is left over
+    behind the last whole row belongs to it.
+    """
+    rows = len(suspects)
+    for r in range(rows):
+        first, n = np.uint64(r * width), np.uint64(width if r < rows - 1 else len(power) - r * width)
+        high = np.float32(0)
+        for k in range(n):
+            re, im = spectrum[first + k].real, spectrum[first + k].imag
+            power[first + k] = re * re + im * im
+            high = max(high, power[first + k])
+        limit, below = high / np.float32(ratio), np.int32(0)
+        for k in range(np.uint64(width)):
+            below += np.int32(power[first + k] < limit)
+        suspects[r] = 2 * below >= width
+
+
 @nb.njit(cache=True, nogil=True)
 def rotate(x, cycles_per_sample, out):
     """out = x exp(-2 pi i f n), planar float32 (2, n); the phase is exact at every 256th sample."""

@@ -31,6 +31,7 @@ class Telemetry:
         self.decoders = {}
         self._base = {}  # channel -> symbol index of its code period 0
         self._end = {}  # satellite -> next symbol index
+        self._heard = {}  # channel -> (code periods, soft symbols) that wait to be decoded
         self._slips = {}  # satellite -> slips at the last call of slipped
         self._tail = {}  # Galileo satellite -> last nine symbol signs, while its pages are not synchronised
         self._matches = {}  # Galileo satellite -> [upright, inverted] sync patterns seen meanwhile
@@ -45,21 +46,37 @@ class Telemetry:
 
     def update(self):
         """Decode what the last ``Tracker.process`` brought -> list of (channel, event) of the decoders."""
+        self.hear()
+        return self.decode()
+
+    def hear(self):
+        """Keep the symbols of the last ``Tracker.process`` until ``decode``: a few slabs together cost little more."""
+        for c in np.flatnonzero(self.tracker.symbol_counts).tolist():
+            rows = self.tracker.symbols[c, : self.tracker.symbol_counts[c]]
+            self._heard.setdefault(c, []).append((rows["code_period"], rows["soft"]))
+
+    def decode(self):
+        """Decode what was heard, before a channel changes hands at the latest -> list of (channel, event)."""
+        heard, self._heard = self._heard, {}
         events = []
-        for c in map(int, np.flatnonzero(self.tracker.symbol_counts)):
+        for c, parts in heard.items():
             if c not in self._base:
                 self.start(c)
-            rows = self.tracker.symbols[c, : self.tracker.symbol_counts[c]]
-            index = self._index(c, rows["code_period"])
-            sign = -1.0 if self.tracker.channels["kind"][c] == KIND_PILOT else 1.0
-            decoder, key = self.decoders[self._satellite(c)], self._satellite(c)
-            # A bit that was cut off leaves a hole in the count: feed the runs between holes.
-            for run in np.split(np.arange(len(index)), np.flatnonzero(np.diff(index) != 1) + 1):
-                symbols = sign * rows["soft"][run]
-                events += [(c, e) for e in decoder.feed(symbols, int(index[run[0]]))]
-                if key[0] == "E" and not decoder.synced:
-                    self._look_for_sync(key, symbols)
-            self._end[key] = int(index[-1]) + 1
+            index = self._index(c, np.concatenate([periods for periods, _ in parts]))
+            sign = np.float32(-1.0 if self.tracker.channels["kind"][c] == KIND_PILOT else 1.0)
+            symbols = sign * np.concatenate([soft for _, soft in parts])
+            events += [(c, e) for e in self._feed(self._satellite(c), index, symbols)]
+        return events
+
+    def _feed(self, key, index, symbols):
+        """Feed the runs between holes: a bit that was cut off leaves one in the count."""
+        decoder, events = self.decoders[key], []
+        ends = [*(np.flatnonzero(np.diff(index) != 1) + 1).tolist(), len(index)]
+        for first, end in zip([0, *ends], ends):
+            events += decoder.feed(symbols[first:end], int(index[first]))
+            if key[0] == "E" and not decoder.synced:
+                self._look_for_sync(key, symbols[first:end])
+        self._end[key] = int(index[-1]) + 1
         return events
 
     def _look_for_sync(self, key, symbols):
