@@ -9,11 +9,19 @@ import math
 from typing import Any, Literal
 
 import numpy as np
+from numba import njit
 from pydantic import BaseModel, ConfigDict, Field
 
 from monitors.records import checked_corr, statistics
 
-__all__ = ["AdcHistogram", "AgcGain", "Cn0Drop", "NoiseFloor", "SignalQuality"]
+__all__ = ["AdcHistogram", "AgcGain", "Cn0Drop", "NoiseFloor", "SignalQuality", "count_levels"]
+
+
+@njit(cache=True, nogil=True)
+def count_levels(x, counts):
+    """Add the int8 samples ``x`` to ``counts`` int64 (256,), level -128 first."""
+    for k in range(x.shape[0]):
+        counts[np.int64(x[k]) + 128] += 1
 
 
 class _Spec(BaseModel):
@@ -188,10 +196,15 @@ class _ModulusRun(_WindowRun):
 class AgcGain(_Spec):
     """Fall of the AGC gain (dB) below its trained level: input ``gain_db`` float (n,), one per epoch.
 
-    Null model: Gaussian about the gain that temperature and noise set. Cost: none.
+    Null model: Gaussian about the trained gain, of the training's variance and that of the slow changes which
+    a short training does not show (``monitors.short_training.WanderNull``). Cost: none.
     """
 
     kind: Literal["AGC"] = "AGC"
+    wander_db: float = Field(0.1, gt=0, le=10)
+    """Standard deviation of slow changes of the gain that are no interference: temperature, fading (assumed)."""
+    window_s: float = Field(0.1, ge=0.02, le=10)
+    """The receiver reads the gain this often."""
 
     def start(self, taps_chips, integration_s, signal="L1CA", prn=1, waveform=None):
         """-> Run; ``integration_s`` is the interval of the gains."""
@@ -217,33 +230,43 @@ class _AgcRun(_Restart):
 class AdcHistogram(_Spec):
     """Chi-square of ADC level counts against the trained proportions: input ``counts`` int (n, levels).
 
-    Statistic: sum (O - E)^2 / E. Null model: chi2 of (occupied levels - 1) degrees for independent samples
-    (Bastide et al., ION GNSS 2003); oversampled data are correlated, so take the threshold from training.
+    Neighbouring levels are pooled to at most ``groups`` of about the same probability: no cell is empty, and a
+    change of power is not lost among hundreds of degrees.
+    Statistic: sum (O - E)^2 / E. Null model: chi2 of (groups - 1) degrees for independent samples (Bastide et al.,
+    ION GNSS 2003); oversampled data are correlated, so take the threshold from training.
     Cost: a histogram.
     """
 
     kind: Literal["ADC"] = "ADC"
+    groups: int = Field(16, ge=2, le=256)
+    """Largest number of groups of levels."""
+    samples: int = Field(50_000, ge=1000, le=1_000_000)
+    """Samples that the receiver puts into each histogram (I and Q count both)."""
+    window_s: float = Field(0.1, ge=0.02, le=10)
+    """The receiver takes a histogram this often."""
 
     def start(self, taps_chips, integration_s, signal="L1CA", prn=1, waveform=None):
         """-> Run; ``integration_s`` is the interval of the histograms."""
-        return _AdcRun(integration_s)
+        return _AdcRun(integration_s, self.groups)
 
 
 class _AdcRun(_Restart):
     totals: Any  # float (levels,); None before training
 
-    def __init__(self, integration_s):
-        self.integration_s, self.totals, self.epoch = integration_s, None, 0
+    def __init__(self, integration_s, groups):
+        self.integration_s, self.groups, self.totals, self.epoch = integration_s, groups, None, 0
 
     def train(self, counts):
         """Add quiet histograms, int (n, levels)."""
         total = np.asarray(counts, float).sum(axis=0)
         self.totals = total if self.totals is None else self.totals + total
+        self._group = _pool(self.totals / self.totals.sum(), self.groups)
+        self._share = np.bincount(self._group, self.totals) / self.totals.sum()
 
     @property
     def degrees(self):
         """Degrees of freedom of the null chi-square."""
-        return int(np.count_nonzero(self.totals)) - 1
+        return len(self._share) - 1
 
     def __call__(self, counts, sample_index=None):
         """STATISTIC (n,) of histograms, int (n, levels)."""
@@ -252,14 +275,20 @@ class _AdcRun(_Restart):
         counts = np.asarray(counts, float)
         if counts.ndim != 2 or counts.shape[1] != len(self.totals):
             raise ValueError(f"histograms have shape {counts.shape}, training had {len(self.totals)} levels")
-        used = self.totals > 0
-        expected = counts.sum(axis=1, keepdims=True) * (self.totals / self.totals.sum())[used]
-        value = ((counts[:, used] - expected) ** 2 / expected).sum(axis=1)
-        # A level never seen in training has no expectation: any count there is infinitely surprising.
-        value[counts[:, ~used].any(axis=1)] = np.inf
+        pooled = np.stack([np.bincount(self._group, row, len(self._share)) for row in counts])
+        expected = counts.sum(axis=1, keepdims=True) * self._share
+        value = ((pooled - expected) ** 2 / expected).sum(axis=1)
         epochs = self.epoch + np.arange(len(value))
         self.epoch += len(value)
         return statistics(value, epochs, self.integration_s, np.nan, sample_index)
+
+
+def _pool(share, groups):
+    """Group of each level, 0 ..: neighbours share one, every group has been seen; at most ``groups``."""
+    middle = np.cumsum(share) - 0.5 * share
+    group = np.minimum((groups * middle).astype(int), groups - 1)
+    seen = np.unique(group[share > 0])
+    return np.maximum(np.searchsorted(seen, group, "right") - 1, 0)
 
 
 def _window(window_s, integration_s, least):

@@ -23,6 +23,7 @@ from signals.modulation import autocorrelation
 __all__ = ["GlrtMonitor", "GlrtRun"]
 
 _BLOCK = 256  # epochs at a time: the products stay in the second-level cache
+_MANY_DEGREES = 1e7  # of the noise variance, from which it counts as known
 _GUARD_CHIPS = {"L1CA": (-0.3, 0.0, 0.3, 0.65, 1.0), "E1B": (-0.15, 0.0, 0.15, 0.3, 0.6)}
 
 
@@ -235,12 +236,20 @@ class GlrtRun:
         return float(np.mean(values > t) * math.exp(t))
 
     def threshold(self, p_fa, n_eff):
-        """t with N_eff Q(M, t) = P_FA (M = 1: ln(N_eff / P_FA)); Q the regularised upper incomplete gamma."""
-        from scipy.special import gammainccinv
+        """t with N_eff Q(M, t) = P_FA (M = 1: ln(N_eff / P_FA)); Q the regularised upper incomplete gamma.
+
+        A noise variance from n training epochs of ``rank`` dimensions has nu = 2 n rank degrees of freedom, so that
+        T / M is F distributed with 2 M and nu of them: what a training of seconds leaves open.
+        """
+        from scipy.special import betaincinv, gammainccinv
 
         if not 0 < p_fa < 1:
             raise ValueError(f"p_fa = {p_fa:g} must lie between 0 and 1")
-        return float(gammainccinv(self.spec.accumulate_epochs, min(p_fa / n_eff, 1.0)))
+        M, p = self.spec.accumulate_epochs, min(p_fa / n_eff, 1.0)
+        nu = 2 * self.rank * self.count if self.spec.noise_variance is None else 0
+        if not 0 < nu < _MANY_DEGREES:
+            return float(gammainccinv(M, p))
+        return float(0.5 * nu * (1 / betaincinv(0.5 * nu, M, p) - 1))
 
     def miss_probability(self, amplitude, frequency_hz, threshold):
         """P_MD against a CW of ``amplitude`` at one tap: single bin, so an upper bound when f is on the

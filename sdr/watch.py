@@ -1,55 +1,39 @@
-"""Monitors on the receiver's live correlator outputs: section ``[[receiver.monitor]]``.
+"""Monitors on the receiver's live correlator outputs and on its front end: section ``[[receiver.monitor]]``.
 
 Each locked channel is trained on its own first seconds and then watched. Correlator outputs reach a monitor as
-means over 20 ms (L1CA) or 100 ms (E1) with the data signs wiped; nothing flows back into the receiver.
-
-Thresholds at a P_FA without a million quiet live epochs. The GLRT's comes from its analytic null. For the FFT and
-the AR monitor the twin lives through the same training many times, at the channel's own C/N0 and under the echoes
-that are to be expected: what it then shows in quiet, a short training's errors included, is the null. The others'
-training holds a few windows only: Student's t.
+means over 20 ms (L1CA) or 100 ms (E1) with the data signs wiped. Nothing flows back into the receiver but ``Flags``.
+When lock is lost an alarm that stands is held until tests go on: interference that kills a channel does not end in
+silence. ``watch_null`` says where the thresholds come from, ``watch_front`` what the gain and the samples' levels show.
 """
 
 import math
-from functools import lru_cache
 from itertools import pairwise
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from monitors.baselines import Cn0Drop, NoiseFloor, SignalQuality
+from monitors.baselines import AdcHistogram, AgcGain, Cn0Drop, NoiseFloor, SignalQuality
 from monitors.fft import FftMonitor
 from monitors.glrt import GlrtMonitor
 from monitors.multichannel_ar import MultichannelAr
-from monitors.records import STATISTIC, alarms
-from monitors.threshold import ParetoNull, per_epoch
 from nav.navlog import REMEDY, Remedy
+from sdr.watch_front import FrontWatch
+from sdr.watch_null import null_of, one_blas_thread
+from sdr.watch_post import MONITOR, Post
 from signals.multipath import MultipathSpec
 from tracking.channel import STATE_LOCKED
-from tracking.correlator_model import Twin
 
 Detector = Annotated[
-    FftMonitor | GlrtMonitor | MultichannelAr | Cn0Drop | NoiseFloor | SignalQuality,
+    FftMonitor | GlrtMonitor | MultichannelAr | Cn0Drop | NoiseFloor | SignalQuality | AgcGain | AdcHistogram,
     Field(discriminator="kind"),
 ]
 EPOCH_S = {"L1CA": 0.02, "E1B": 0.1, "E1C": 0.1}
 """Length of a monitor's epoch; the AR model needs more vectors than 100 ms give and takes 20 ms of E1 too."""
-NULL_EPOCHS = 102_400
-"""Quiet epochs of the twin behind a threshold of the FFT or AR monitor."""
-MONITOR = np.dtype([("signal", "S4"), ("prn", "i4"), *((n, STATISTIC[n]) for n in STATISTIC.names or ())])
-"""STATISTIC of one channel; ``t_s`` is scenario time at the end of its last epoch."""
-WATCHED = np.dtype(
-    [
-        ("monitor", "S16"),
-        ("signal", "S4"),
-        ("prn", "i4"),
-        ("threshold", "f8"),
-        ("p_fa", "f8"),  # per test
-        ("trained_s", "f8"),  # scenario time from which it tests
-        ("tests", "i8"),
-    ]
-)
-"""One monitor on one channel."""
+RESETTLE_S = 0.5
+"""After a loss of lock a monitor goes on this much after lock is back."""
+LOST_S = 0.5
+"""A channel that gave no integration for so long at the end of a run was lost."""
 
 
 class WatchSpec(BaseModel):
@@ -67,23 +51,33 @@ class WatchSpec(BaseModel):
     """Whether it is meant per epoch or per approach."""
     approach_s: float = Field(150.0, gt=0)
     """Length of an approach."""
-    channels: int = Field(8, ge=1, le=100)  # tested in parallel, for p_fa_per = "approach"
-    threshold: float | None = None  # given outright
-    expect_multipath: MultipathSpec | None = None  # echoes that must not alarm
-    settle_s: float = Field(3.0, ge=0)  # after lock, before training
-    training_s: float = Field(20.0, gt=1, le=3600)
+    channels: int = Field(8, ge=1, le=100)
+    """Channels tested in parallel, for the P_FA per approach."""
+    threshold: float | None = None
+    """Threshold given outright, instead of by ``p_fa``."""
+    expect_multipath: MultipathSpec | None = None
+    """Echoes that must not alarm (FFT and AR)."""
+    settle_s: float = Field(3.0, ge=0, le=3600)
+    """Time from lock to training."""
+    training_s: float = Field(20.0, ge=0.1, le=3600)
     """Seconds of each channel that train its monitor."""
     batch_s: float = Field(1.0, ge=0.02, le=10)
     """Statistics are computed this often: a call costs more than an epoch, and an answer cannot come sooner."""
-    gap_s: float = Field(1.0, ge=0)  # exceedances closer than this are one alarm
+    gap_s: float = Field(1.0, ge=0)
+    """Exceedances closer than this are one alarm."""
 
-    def start(self, fs_hz: float) -> "Watch":
-        """-> Watch."""
-        return Watch(self, fs_hz)
+    @property
+    def of_front_end(self) -> bool:
+        """Whether it watches the front end, not the channels."""
+        return isinstance(self.detector, AgcGain | AdcHistogram)
+
+    def start(self, fs_hz: float) -> "Watch | FrontWatch":
+        """-> Watch of the channels, or FrontWatch of the samples."""
+        return FrontWatch(self, fs_hz) if self.of_front_end else Watch(self, fs_hz)
 
 
 class Watch:
-    """Run of a WatchSpec: every channel's monitor, its training and its statistics."""
+    """Run of a WatchSpec on the channels: every channel's monitor, its training and its statistics."""
 
     def __init__(self, spec: WatchSpec, fs_hz: float) -> None:
         self.spec, self.fs_hz = spec, fs_hz
@@ -104,18 +98,22 @@ class Watch:
             self.channels[key] = _Channel(self.spec, self.fs_hz, signal, prn, taps, waveform)
         return self.channels[key].advance(epochs, corr)
 
-    def flush(self) -> list[np.ndarray]:
-        """MONITOR rows of what still waits for a batch."""
-        return [c.batch() for c in self.channels.values()]
+    @property
+    def posts(self) -> list[Post]:
+        """The monitor of each channel."""
+        return [c.post for c in self.channels.values()]
 
-    def watched(self) -> np.ndarray:
-        """WATCHED rows of the channels whose training is complete."""
-        ready = [c for c in self.channels.values() if c.threshold is not None]
-        return np.array([c.row() for c in ready], WATCHED)
+    def report(self, quiet_until_s: float) -> list[dict[str, Any]]:
+        """Rows for JSON, one per channel; one that says why if there was none to watch."""
+        if not self.channels:
+            why = "there was no channel to watch: nothing with a window of taps was tracked"
+            return [{"name": self.spec.name, "signal": "", "prn": 0, "threshold": None, "p_fa": self.spec.p_fa,
+                     "tests": 0, "alarms": [], "unavailable": why}]  # fmt: skip
+        return [post.report(quiet_until_s) for post in self.posts]
 
-    def alarms(self) -> dict[tuple[str, int], np.ndarray]:
-        """{(signal, prn): ALARM rows} so far, of the channels whose training is complete."""
-        return {k: c.alarms() for k, c in self.channels.items() if c.threshold is not None}
+    def flush(self, sample: int) -> list[np.ndarray]:
+        """MONITOR rows of what still waits for a batch when the run ends at ``sample``."""
+        return [c.finish(sample) for c in self.channels.values()]
 
 
 class Flags:
@@ -151,6 +149,8 @@ class Flags:
 
 
 class _Channel:
+    """A channel's integrations, cut into stretches of lock and summed to epochs, on their way to its monitor."""
+
     def __init__(
         self, spec: WatchSpec, fs_hz: float, signal: str, prn: int, taps: tuple, waveform: str | None
     ) -> None:
@@ -158,47 +158,102 @@ class _Channel:
         self.epoch_s = 0.02 if isinstance(spec.detector, MultichannelAr) else EPOCH_S[signal]
         # The GLRT knows the true offsets; the others want an even spacing, from which these differ by 1/128 sample.
         self.taps = taps[1] if isinstance(spec.detector, GlrtMonitor) else taps[0]
-        self.run = spec.detector.start(self.taps, self.epoch_s, signal, prn, waveform)
+        run: Any = spec.detector.start(self.taps, self.epoch_s, signal, prn, waveform)
+        hop = getattr(run, "hop", 0) or getattr(run, "length", 0)
+        test_s = self.epoch_s * (hop or getattr(spec.detector, "accumulate_epochs", 1))
+        self.post = Post(spec, fs_hz, run, self.epoch_s, test_s, self._null, signal, prn)
         self.prompt = int(np.argmin(np.abs(self.taps)))
-        self.threshold: float | None = None
-        self.trained_s = math.nan
-        self.tests = 0
-        self._above: list[np.ndarray] = []
         self._cn0: list[float] = []
-        self._quiet: list[np.ndarray] = []
-        self._locked_at: int | None = None
+        self._heard: list[tuple[np.ndarray, np.ndarray]] = []
+        self._heard_s = 0.0
+        self._settled: float = math.nan  # sample from which it counts
         self._next = -1
-        self._restart()
+        self._lost: int | None = None  # end of the last stretch
+        self._drop()
 
-    def _restart(self) -> None:
+    @property
+    def threshold(self) -> float | None:
+        """Of the monitor; None during training."""
+        return self.post.threshold
+
+    @property
+    def run(self) -> Any:
+        """The monitor."""
+        return self.post.run
+
+    def _null(self, corr: np.ndarray) -> Any:
+        self.cn0_dbhz = float(np.mean(self._cn0))
+        return null_of(self, corr)
+
+    def advance(self, epochs: np.ndarray, corr: np.ndarray) -> np.ndarray:
+        """Take in integrations; every ``batch_s`` they are worked on, for a call costs more than an epoch."""
+        self._heard.append((epochs.copy(), corr.copy()))
+        self._heard_s += float(epochs["n_samples"].sum()) / self.fs_hz
+        return self._work() if self._heard_s >= self.spec.batch_s else np.empty(0, MONITOR)
+
+    def finish(self, sample: int) -> np.ndarray:
+        """MONITOR rows of what waits; a channel that is not locked at the end has been so since it was lost."""
+        rows = [self._work(), self._batch()]
+        if self._next >= 0 and sample - self._next > LOST_S * self.fs_hz:
+            self._lose()
+        if self._lost is not None:
+            self.post.rest(self._lost / self.fs_hz, sample / self.fs_hz)
+        return np.concatenate(rows)
+
+    def _work(self) -> np.ndarray:
+        if not self._heard:
+            return np.empty(0, MONITOR)
+        epochs, corr = (np.concatenate(part) for part in zip(*self._heard))
+        self._heard, self._heard_s = [], 0.0
+        out = [np.empty(0, MONITOR)]
+        with one_blas_thread():
+            for part in _stretches(epochs):
+                out += self._stretch(epochs[part], corr[part])
+        return np.concatenate(out)
+
+    def _stretch(self, e: np.ndarray, corr: np.ndarray) -> list[np.ndarray]:
+        """MONITOR rows of consecutive integrations in one state."""
+        out, first = [], int(e["sample_index"][0])
+        if first != self._next:
+            out.append(self._lose())
+        if e["state"][0] != STATE_LOCKED:
+            out.append(self._lose())
+            return out
+        self._next = int(e["sample_index"][-1]) + int(e["n_samples"][-1])
+        self._resume(first)
+        settled = e["sample_index"] >= self._settled
+        if self.threshold is None:
+            self._cn0 += e["cn0_dbhz"][settled].tolist()
+        self._take(e[settled], corr[settled])
+        # Always the same batches, however the samples were cut into slabs.
+        n = max(1, round(self.spec.batch_s / self.epoch_s))
+        while sum(map(len, self._waiting)) >= n:
+            out.append(self._batch(n))
+        return out
+
+    def _lose(self) -> np.ndarray:
+        """Lock ends: test what is whole, drop the rest."""
+        if self._next < 0:
+            return np.empty(0, MONITOR)
+        rows = self._batch()
+        self._lost, self._next = self._next, -1
+        self._drop()
+        return rows
+
+    def _resume(self, sample: int) -> None:
+        """Lock is back at ``sample``, or the run ends there: what was not watched ends."""
+        if math.isnan(self._settled):
+            self._settled = sample + self.spec.settle_s * self.fs_hz
+        elif self._lost is not None:
+            self._settled = max(self._settled, sample + RESETTLE_S * self.fs_hz)
+            self.post.rest(self._lost / self.fs_hz, self._settled / self.fs_hz)
+        self._lost = None
+
+    def _drop(self) -> None:
         self._dumps = np.empty((0, len(self.taps)), np.complex64)
         self._dump_ends = np.empty(0, np.int64)
         self._waiting: list[np.ndarray] = []
         self._ends: list[np.ndarray] = []
-        if self.threshold is not None:
-            self.run = self.run.fresh()
-
-    def advance(self, epochs: np.ndarray, corr: np.ndarray) -> np.ndarray:
-        out = []
-        for part in _stretches(epochs):
-            e = epochs[part]
-            if int(e["sample_index"][0]) != self._next:
-                out.append(self.batch())
-                self._restart()
-            self._next = int(e["sample_index"][-1]) + int(e["n_samples"][-1])
-            if e["state"][0] != STATE_LOCKED:
-                self._next = -1
-                continue
-            if self._locked_at is None:
-                self._locked_at = int(e["sample_index"][0])
-            settled = e["sample_index"] >= self._locked_at + self.spec.settle_s * self.fs_hz
-            self._cn0 += e["cn0_dbhz"][settled].tolist() if self.threshold is None else []
-            self._take(e[settled], corr[part][settled])
-            # Always the same batches, however the samples were cut into slabs.
-            n = max(1, round(self.spec.batch_s / self.epoch_s))
-            while sum(map(len, self._waiting)) >= n:
-                out.append(self.batch(n))
-        return np.concatenate(out) if out else np.empty(0, MONITOR)
 
     def _take(self, epochs: np.ndarray, corr: np.ndarray) -> None:
         """Sum integrations to monitor epochs, their signs wiped by the prompt's."""
@@ -217,166 +272,21 @@ class _Channel:
             self._waiting.append(corr)
             self._ends.append(ends)
 
-    def batch(self, n: int | None = None) -> np.ndarray:
-        """Train on, or test, the first ``n`` (all) of what has come together -> MONITOR rows."""
+    def _batch(self, n: int | None = None) -> np.ndarray:
+        """Hand the first ``n`` (all) of what has come together to the monitor -> MONITOR rows."""
         if not self._waiting:
             return np.empty(0, MONITOR)
         corr, ends = np.concatenate(self._waiting), np.concatenate(self._ends)
         n = len(corr) if n is None else n
-        self._waiting, self._ends = [corr[n:]], [ends[n:]]
-        corr, ends = corr[:n], ends[:n]
-        if not len(corr):
-            return np.empty(0, MONITOR)
-        if self.threshold is None:
-            self._quiet.append(corr)
-            if sum(map(len, self._quiet)) * self.epoch_s >= self.spec.training_s:
-                self._train(np.concatenate(self._quiet))
-                self.trained_s = float(ends[-1]) / self.fs_hz
-            return np.empty(0, MONITOR)
-        with one_blas_thread():
-            s = self.run(corr, ends)
-        s["t_s"] = s["sample_index"] / self.fs_hz
-        self.tests += len(s)
-        self._note(s)
-        rows = np.empty(len(s), MONITOR)
-        rows["signal"], rows["prn"] = self.signal.encode(), self.prn
-        for name in STATISTIC.names or ():
-            rows[name] = s[name]
-        return rows
-
-    def _note(self, s: np.ndarray) -> None:
-        """Keep what alarms are made of: values at or above the threshold."""
-        above = s[s["value"] >= self.threshold]
-        if len(above):
-            self._above.append(above)
-
-    def alarms(self) -> np.ndarray:
-        """ALARM rows so far."""
-        above = np.concatenate(self._above) if self._above else np.zeros(0, STATISTIC)
-        if not len(above):
-            return alarms(above, self.threshold, self.spec.name, self.signal, self.prn)
-        # Exceedances further apart than the gap are parted by a value below, so that they are alarms of their own.
-        cut = np.flatnonzero(np.diff(above["t_s"]) > max(self.spec.gap_s, 1.5 * self.epoch_s)) + 1
-        parts = np.split(above, cut)
-        return np.concatenate(
-            [alarms(p, self.threshold, self.spec.name, self.signal, self.prn) for p in parts]
-        )
-
-    def row(self) -> tuple:
-        return (
-            self.spec.name.encode(), self.signal.encode(), self.prn, self.threshold, self.p_fa, self.trained_s, self.tests,
-        )  # fmt: skip
-
-    # -- training ---------------------------------------------------------------------------------------------------
-
-    @property
-    def p_fa(self) -> float:
-        """Per test."""
-        if self.spec.p_fa_per == "epoch":
-            return self.spec.p_fa
-        return per_epoch(self.spec.p_fa, self._test_s(), self.spec.channels, self.spec.approach_s)
-
-    def _test_s(self) -> float:
-        """Time between tests."""
-        hop = getattr(self.run, "hop", 0) or getattr(self.run, "length", 0)
-        return self.epoch_s * (hop or getattr(self.spec.detector, "accumulate_epochs", 1))
-
-    def _train(self, corr: np.ndarray) -> None:
-        self._quiet = []
-        detector = self.spec.detector
-        with one_blas_thread():
-            self.run.train(corr)
-        if self.spec.threshold is not None:
-            self.threshold = self.spec.threshold
-        elif isinstance(detector, GlrtMonitor):
-            n_eff = _effective_bins(detector, tuple(self.taps), self.epoch_s, self.signal, self.prn)
-            self.threshold = self.run.threshold(self.p_fa, n_eff)
-        elif isinstance(detector, FftMonitor | MultichannelAr):
-            self.threshold = self._rehearsed(len(corr)).isf(self.p_fa)
-        else:
-            self.threshold = self._student_threshold(len(corr))
-        self.run = self.run.fresh()
-
-    def _rehearsed(self, n_train: int) -> ParetoNull:
-        cn0 = min(max(round(float(np.mean(self._cn0))), 20), 70)
-        # Sampled at whole numbers of epochs, so that channels share what they can.
-        n_train = -(-n_train // 50) * 50
-        return _rehearse(
-            self.spec.detector, tuple(self.taps), self.epoch_s, self.signal, self.prn, self.waveform, cn0, n_train,
-            self.spec.expect_multipath,
-        )  # fmt: skip
-
-    def _student_threshold(self, n_epochs: int) -> float:
-        from scipy.stats import t
-
-        n = n_epochs // self.run.length
-        if n < 5:
-            raise ValueError(
-                f"monitor '{self.spec.name}': {n} training windows are too few for a threshold; lengthen training_s "
-                "or shorten window_s"
-            )
-        two = 2 if self.spec.detector.kind == "SQM" else 1
-        return float(t.isf(self.p_fa / two, n - 1)) * math.sqrt(1 + 1 / n)
-
-
-@lru_cache(maxsize=1)
-def _blas() -> Any:
-    import scipy.linalg  # noqa: F401  (brings a BLAS of its own, which must be loaded to be limited)
-    from threadpoolctl import ThreadpoolController
-
-    return ThreadpoolController()
-
-
-def one_blas_thread() -> Any:
-    """Context in which one BLAS thread works: on small matrices several are slower, and change the last bit."""
-    return _blas().limit(limits=1, user_api="blas")
+        self._waiting, self._ends = ([corr[n:]], [ends[n:]]) if n < len(corr) else ([], [])
+        return self.post.take(corr[:n], ends[:n]) if len(corr) else np.empty(0, MONITOR)
 
 
 def _stretches(epochs: np.ndarray) -> list[slice]:
     """Slices of consecutive integrations in one state."""
-    if not len(epochs):
-        return []
     follows = epochs["sample_index"][1:] == epochs["sample_index"][:-1] + epochs["n_samples"][:-1].astype(
         np.uint64
     )
     cut = np.flatnonzero(~follows | (np.diff(epochs["state"].astype(int)) != 0)) + 1
     edges = [0, *cut.tolist(), len(epochs)]
     return [slice(a, b) for a, b in pairwise(edges)]
-
-
-@lru_cache(maxsize=64)
-def _effective_bins(detector: Any, taps: tuple, epoch_s: float, signal: str, prn: int) -> float:
-    run = detector.start(np.array(taps), epoch_s, signal, prn, None)
-    run.noise_variance = 1.0
-    return run.effective_bins(100_000)
-
-
-@lru_cache(maxsize=64)
-def _rehearse(
-    detector: Any, taps: tuple, epoch_s: float, signal: str, prn: int, waveform: str | None, cn0_dbhz: float,
-    n_train: int, multipath: Any,
-) -> ParetoNull:  # fmt: skip
-    """Null of a statistic after a training of ``n_train`` epochs: many quiet twins, each trained and then tested."""
-    twin = Twin(
-        signal=signal, prn=prn, waveform=waveform, cn0_dbhz=cn0_dbhz, integration_s=epoch_s, taps_chips=taps,
-        multipath=multipath,
-    )  # fmt: skip
-    n_test = max(1024, n_train)
-    out = []
-    with one_blas_thread():
-        for trial in range(-(-NULL_EPOCHS // n_test)):
-            corr = twin.start_open(np.random.SeedSequence(0, spawn_key=(prn, trial)))(n_train + n_test)
-            run = detector.start(np.array(taps), epoch_s, signal, prn, waveform)
-            run.train(corr[:n_train])
-            out.append(_every_value(run, corr[n_train:]))
-    return ParetoNull.fit(np.concatenate(out))
-
-
-def _every_value(run: Any, corr: np.ndarray) -> np.ndarray:
-    """Statistic at every epoch; of the AR monitor for every window, whatever its hop."""
-    if not isinstance(run.spec, MultichannelAr):
-        return run(corr)["value"]
-    if run.spec.form == "refit":
-        return run(corr)["value"]
-    total = np.concatenate([[0.0], np.cumsum(run.energies(run._prepare(corr)))])
-    return np.log((total[run.window :] - total[: -run.window]) / run.window)

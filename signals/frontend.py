@@ -202,6 +202,7 @@ class FrontEnd:
         self._skip = (len(taps) - 1) // 2 if spec.filter and spec.filter.delay == "removed" else 0
         self._past = np.zeros((2, len(taps) - 1), np.float32)
         self._agc = np.array([gain, 0.0, 0.0])
+        self._agc_trace: list[tuple[int, float]] = []
         self._target = gain * rms
         self._in = self._out = 0
         self._wander = _Wander(spec.impairments, spec.fs_hz, seed)
@@ -210,6 +211,11 @@ class FrontEnd:
     def agc_gain_db(self) -> float:
         """Gain of the loop now, relative to the ideal one."""
         return float(20 * math.log10(self._agc[0] / self.gain))
+
+    def agc_trace_db(self, sample_index) -> np.ndarray:
+        """Gain of the loop at these samples, float64, as it was at the end of the push before; none without a loop."""
+        at, gain_db = (np.array(part) for part in zip(*[(-1, 0.0), *self._agc_trace]))
+        return gain_db[np.searchsorted(at, np.atleast_1d(sample_index).astype(np.int64), "right") - 1]
 
     def __call__(self, iq: np.ndarray) -> np.ndarray:
         """Float32 (2, n) -> samples (2, n) of ``dtype``."""
@@ -232,6 +238,7 @@ class FrontEnd:
             return self._quantise(iq, self.gain)
         share = 1.0 - math.exp(-BLOCK / self.spec.fs_hz / self.spec.agc.time_constant_s)
         control(iq, float(BLOCK), share, self._target, self._agc, 2 if self.spec.complex else 1)
+        self._agc_trace.append((self._out, self.agc_gain_db))
         return self._quantise(iq, np.float32(1.0))
 
     def _quantise(self, iq: np.ndarray, gain: np.float32) -> np.ndarray:

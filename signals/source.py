@@ -170,6 +170,10 @@ class SyntheticSource:
                 rows.append(part)
         return np.concatenate(rows)
 
+    def agc_gain_db(self, sample_index) -> np.ndarray | None:
+        """Gain of the control loop at samples that have been read, float64 (n,), dB re the ideal; None without one."""
+        return None if self.spec.agc is None else self.front_end.agc_trace_db(sample_index)
+
     def fault_truth(self, sample_index) -> np.ndarray:
         """FAULT_TRUTH rows at these samples, by sample, then fault."""
         faults = getattr(self.sky, "fault_truth", None)

@@ -1,6 +1,7 @@
 """Live monitors: thresholds, alarms on a jammed channel, and no influence on the receiver."""
 
 import json
+import math
 from types import SimpleNamespace
 
 import h5py
@@ -46,7 +47,9 @@ def watched(detector, jammers=(), seconds=60.0, cut=(0.2,), seed=1, signal="L1CA
             watch(signal, prn, epochs[i : i + n], corr[i : i + n], (taps, taps), SIGNALS[signal].waveform)
         )
         i, k = i + n, k + 1
-    return watch, np.concatenate(rows + watch.flush())
+    return watch, np.concatenate(
+        rows + watch.flush(int(epochs[-1]["sample_index"] + epochs[-1]["n_samples"]))
+    )
 
 
 @pytest.mark.parametrize(
@@ -56,10 +59,10 @@ def test_quiet_channel_does_not_alarm_and_a_tone_does(detector):
     jam = TwinCW(js_db=12.0, offset_hz=-80.0, rate_hz_s=2.0, start_s=40.0)
     watch, rows = watched(detector, (jam,))
     assert rows.dtype == MONITOR
-    (alarms,) = watch.alarms().values()
+    alarms = watch.posts[0].alarms()
     assert len(alarms)
     assert alarms["start_s"].min() > 40.0
-    (row,) = watch.watched()
+    (row,) = watch.posts[0].watched()
     assert 23.0 <= row["trained_s"] <= 24.1
     assert row["tests"] == len(rows)
     assert alarms["peak"].max() >= row["threshold"] == alarms["threshold"][0]
@@ -74,7 +77,7 @@ def test_thresholds_deliver_their_p_fa():
         for seed in range(6):
             watch, rows = watched(detector, seconds=150.0, seed=seed, p_fa=1e-3)
             tests += len(rows)
-            hits += np.count_nonzero(rows["value"] >= watch.watched()["threshold"][0])
+            hits += np.count_nonzero(rows["value"] >= watch.posts[0].threshold)
         due = 1e-3 * tests
         assert abs(hits - due) < 5 * np.sqrt(due) + 1, (detector, hits, due)
 
@@ -88,7 +91,7 @@ def test_slabs_do_not_matter():
 def test_galileo_dumps_are_summed_to_100_ms():
     watch, rows = watched({"kind": "GLRT"}, signal="E1C", prn=11, seconds=40.0)
     assert np.allclose(np.diff(rows["t_s"]), 0.1)
-    assert not len(next(iter(watch.alarms().values())))
+    assert not len(watch.posts[0].alarms())
 
 
 def test_a_gap_restarts_the_monitor_but_keeps_its_training():
@@ -109,8 +112,17 @@ def test_refusals():
     one = {"name": "a", "detector": {"kind": "FFT"}}
     with pytest.raises(ValueError, match="names must differ"):
         scenario.validate(ReceiverSpec, {"monitor": [one, one]}, "receiver")
-    with pytest.raises(ValueError, match="too few"):
-        watched({"kind": "CN0", "window_s": 10.0}, seconds=40.0)
+
+
+def test_a_monitor_without_enough_training_says_so_and_the_run_goes_on():
+    watch, rows = watched({"kind": "CN0", "window_s": 10.0}, seconds=40.0)
+    (report,) = watch.report(math.inf)
+    assert not len(rows)
+    assert report["threshold"] is None
+    assert "2.0 independent training values are too few" in report["unavailable"]
+    watch, rows = watched({"kind": "GLRT"}, seconds=10.0)
+    (report,) = watch.report(math.inf)
+    assert "it needs 3 s to settle and 20 s of L1CA 6 and had 7 s" in report["unavailable"]
 
 
 @pytest.mark.slow

@@ -1,0 +1,141 @@
+"""Thresholds of the live monitors: null models of statistics that a training of seconds has standardised.
+
+A P_FA of 1e-5 needs a million quiet epochs, a channel has twenty quiet seconds. The GLRT's null is analytic. For the
+FFT and the AR monitor the twin *rehearses*: it lives through the same training many times over, each time with
+another satellite, at the channel's own C/N0 and under the echoes that are to be expected; what it shows afterwards,
+the errors of a short training included, is the null. Its seeds are no scenario's. The others take the tail that
+theory gives to the few windows of their training: Student's t, Fisher's F.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from monitors.fft import FftMonitor
+from monitors.glrt import GlrtMonitor
+from monitors.multichannel_ar import MultichannelAr
+from monitors.short_training import StudentNull
+from monitors.threshold import ParetoNull
+from tracking.correlator_model import Twin
+
+REHEARSALS = 60
+"""Trainings that the twin goes through for one threshold."""
+TEST_S = 100.0
+"""Quiet time after each training: a fade has to come and go."""
+TAIL = 0.05
+"""Share of the rehearsed values that the tail is fitted to."""
+WINDOW_STEPS = 5
+"""Steps that a window of the AR monitor is moved by its own length in; windows further apart count as independent."""
+CN0_STEP_DB = 2
+"""Rehearsals are shared between channels of about the same C/N0."""
+PRNS = (1, 8, 20, 27)
+"""Satellites that take turns: the side lobes of the code differ."""
+SEED = 0x72656865
+"""Spawn key of the rehearsals' random numbers, which no scenario has."""
+
+
+def null_of(channel: Any, corr: np.ndarray) -> Any:
+    """Null model of a trained monitor: ``isf(p_fa)`` is its threshold, ``rule`` says where that comes from.
+
+    ``channel``: its ``spec``, ``run``, ``taps``, ``epoch_s``, ``signal``, ``prn``, ``waveform``, ``cn0_dbhz``; ``corr``
+    complex64 (n, K), the epochs it was trained on.
+    """
+    detector = channel.spec.detector
+    if isinstance(detector, GlrtMonitor):
+        bins = _effective_bins(detector, tuple(channel.taps), channel.epoch_s, channel.signal, channel.prn)
+        return GlrtNull(channel.run, bins)
+    if isinstance(detector, FftMonitor | MultichannelAr):
+        cn0 = min(max(CN0_STEP_DB * round(channel.cn0_dbhz / CN0_STEP_DB), 20), 70)
+        n_train = -(-len(corr) // 50) * 50  # so that channels share what they can
+        return _rehearse(
+            detector, tuple(channel.taps), channel.epoch_s, channel.signal, channel.waveform, cn0, n_train,
+            channel.spec.expect_multipath,
+        )  # fmt: skip
+    return StudentNull.fit(channel.run.values(corr), two_sided=detector.kind == "SQM")
+
+
+@dataclass(frozen=True)
+class GlrtNull:
+    """The GLRT's own: ``GlrtRun.threshold``."""
+
+    run: Any
+    bins: float
+    rule: str = "analytic"
+
+    def isf(self, p_fa: float) -> float:
+        """Threshold."""
+        return self.run.threshold(p_fa, self.bins)
+
+
+@dataclass(frozen=True)
+class RehearsedNull:
+    """A Pareto tail as far as the rehearsals reach (1 / n_effective), an exponential one of its mean excess beyond.
+
+    The tail of every statistic here is shorter than that: what is extrapolated is on the safe side.
+    """
+
+    tail: ParetoNull
+
+    @property
+    def rule(self) -> str:
+        """Name of the rule."""
+        return "rehearsed"
+
+    def isf(self, p_fa: float) -> float:
+        """Threshold."""
+        reach = 1.0 / self.tail.n_effective
+        if p_fa >= reach:
+            return self.tail.isf(p_fa)
+        mean_excess = self.tail.sigma / (1 - self.tail.xi)
+        return self.tail.isf(reach) + mean_excess * math.log(reach / p_fa)
+
+
+@lru_cache(maxsize=64)
+def _effective_bins(detector: Any, taps: tuple, epoch_s: float, signal: str, prn: int) -> float:
+    run = detector.start(np.array(taps), epoch_s, signal, prn, None)
+    run.noise_variance = 1.0
+    with one_blas_thread():
+        return run.effective_bins(100_000)
+
+
+@lru_cache(maxsize=64)
+def _rehearse(
+    detector: Any, taps: tuple, epoch_s: float, signal: str, waveform: str | None, cn0_dbhz: float, n_train: int,
+    multipath: Any,
+) -> RehearsedNull:  # fmt: skip
+    """Null of a statistic after a training of ``n_train`` epochs: many quiet twins, each trained and then tested."""
+    overlap = 1.0
+    if isinstance(detector, MultichannelAr):
+        overlap = 1 / WINDOW_STEPS
+        detector = detector.model_copy(update={"hop_s": detector.window_s * overlap})
+    n_test = max(round(TEST_S / epoch_s), n_train)
+    values = []
+    with one_blas_thread():
+        for trial in range(REHEARSALS):
+            prn = PRNS[trial % len(PRNS)]
+            twin = Twin(
+                signal=signal, prn=prn, waveform=waveform, cn0_dbhz=cn0_dbhz, integration_s=epoch_s,
+                taps_chips=taps, multipath=multipath,
+            )  # fmt: skip
+            corr = twin.start_open(np.random.SeedSequence(0, spawn_key=(SEED, trial)))(n_train + n_test)
+            run = detector.start(np.array(taps), epoch_s, signal, prn, waveform)
+            run.train(corr[:n_train])
+            values.append(run(corr[n_train:])["value"])
+    pooled = np.concatenate(values)
+    return RehearsedNull(ParetoNull.fit(pooled, TAIL, n_effective=overlap * len(pooled)))
+
+
+@lru_cache(maxsize=1)
+def _blas() -> Any:
+    import scipy.linalg  # noqa: F401  (brings a BLAS of its own, which must be loaded to be limited)
+    from threadpoolctl import ThreadpoolController
+
+    return ThreadpoolController()
+
+
+def one_blas_thread() -> Any:
+    """Context in which one BLAS thread works: on small matrices several are slower, and change the last bit."""
+    return _blas().limit(limits=1, user_api="blas")
