@@ -381,7 +381,7 @@ def _monitors(receiver: Receiver, source: Any) -> list[dict[str, Any]]:
 
 
 def _fix(receiver: Receiver, source: Any, tally: _Tally) -> dict[str, Any] | None:
-    if not tally.fixes:
+    if not tally.fixes or receiver.drift.inverted:
         return None
     rows = np.concatenate(tally.fixes)
     mean = rows["pos_ecef_m"].mean(axis=0)
@@ -408,7 +408,12 @@ def _why_no_fix(receiver: Receiver, duration_s: float, satellites: list[dict[str
         searched = (
             receiver.searched_text() or "nothing: the recording is shorter than one search, or all zeros"
         )
-        return f"no satellite was found; searched {searched}"
+        return f"no satellite was found; searched {searched}; gnssbb probe shows which declaration of a file fits"
+    if receiver.drift.inverted:
+        return (
+            f"{len(satellites)} satellites were found, but their codes slide against their Dopplers: the spectrum is "
+            "inverted; give --conjugate, or leave it out if it was given"
+        )
     locked = [s for s in satellites if s["locked_s"] > 0]
     with_ephemeris = [s for s in satellites if s["ephemeris"]]
     if duration_s < 18.0 and not with_ephemeris:

@@ -17,6 +17,7 @@ from nav.measurements import transmit_rows
 from nav.navlog import Remedy
 from nav.records import SOLUTION
 from nav.steering import Sensors, Steering
+from sdr.drift import CodeDrift
 from sdr.scenario import ReceiverSpec
 from sdr.watch import Flags, Watch
 from sdr.watch_front import FrontWatch, Overheard
@@ -87,6 +88,7 @@ class Receiver:
         self.fs_hz = float(source.fs_hz)
         self.tracker = spec.tracking.start(source.fs_hz, source.if_hz, spec.codes_path)
         self.telemetry = Telemetry(self.tracker)
+        self.drift = CodeDrift(self.fs_hz)
         self.navigator = spec.navigation.start(source.fs_hz)
         self.steering = self._start_steering(sensors)
         self._aiding: np.ndarray | None = None
@@ -139,6 +141,8 @@ class Receiver:
             self._decode()
         self.position = n_end
         rows = [(c, epochs[c, :n], corr[c, :n]) for c, n in enumerate(counts) if n]
+        for c, mine, _ in rows:
+            self.drift.hear(self.tracker.channels["signal"][c].decode(), mine)
         out = Outcome(n0, n_end, found, rows)
         self._hear(rows)
         if self._steered:
@@ -173,7 +177,10 @@ class Receiver:
         self._recent.append((n0, iq))
         if sum(s.shape[1] for _, s in self._recent) < self._wanted and n_end < self.source.n_samples:
             return np.empty(0, ACQUISITION)
-        first, samples = self._recent[0][0], np.concatenate([s[:, : self._wanted] for _, s in self._recent], axis=1)
+        first, samples = (
+            self._recent[0][0],
+            np.concatenate([s[:, : self._wanted] for _, s in self._recent], axis=1),
+        )
         samples = samples[:, : self._wanted]
         self._recent.clear()
         self._next_retry = n_end + round(RETRY_S * self.fs_hz)
@@ -239,6 +246,8 @@ class Receiver:
     # -- navigation -------------------------------------------------------------------------------------------------
 
     def _navigate(self, sample: int, out: Outcome) -> None:
+        if self.drift.inverted:
+            return
         rows = self.transmit(sample)
         solution = self.navigator.update(
             rows, self.telemetry.ephemerides(), self.telemetry.iono_utc("G"), self.telemetry.iono_utc("E"),
