@@ -9,20 +9,20 @@ import pytest
 
 from nav.ultratight import MODES, SteeringSpec
 from sdr.reproduce import COLUMNS, VERDICTS, karaim, karaim_report
-from sdr.reproduce.karaim import RUN, SWEEP_DB, Case, Size, measure, sweep_name
-from sdr.uttwin import EVERY, T_S, Trial, replace
+from sdr.reproduce.karaim import RUN, SHORT, WHOLE, Case, Drive, Size, measure, sweep_name
+from sdr.uttwin import EVERY, T_S, Trial
 from sdr.uttwin_kernels import N_OUT
 from signals.codes import primary_code
 from signals.constants import CHIP_RATE_HZ
 
-SMALL = Size(20.0, (12.0, 17.0), 2, (0, 50))
+DRIVE = Drive(20.0, (12.0, 17.0))
+SMALL = Size(2, (0, 50), (), (), DRIVE)
 POS2D = karaim_report.POS2D
 
 
 def small_cases():
-    quiet = Trial(jam_s=SMALL.jam_s)
     return [
-        Case(sweep_name(js, m), replace(quiet, js_db=float(js)), SteeringSpec(mode=m))
+        Case(sweep_name(js, m), DRIVE.span_s, Trial(js_db=float(js), jam_s=DRIVE.jam_s), SteeringSpec(mode=m))
         for js in SMALL.levels
         for m in MODES
     ]
@@ -138,7 +138,7 @@ def test_no_line_inside_is_no_interference():
 
 def _made_up(n_runs=50):
     """Runs whose errors are the published ones times a factor per run that straddles one."""
-    cases, runs = karaim.twin_cases(Size(570.0, (180.0, 270.0), n_runs, SWEEP_DB)), {}
+    cases, runs = karaim.twin_cases(WHOLE._replace(n_runs=n_runs)), {}
     factor = np.linspace(0.5, 2.0, n_runs)
     for case in cases:
         r = np.zeros(n_runs, RUN)
@@ -146,7 +146,7 @@ def _made_up(n_runs=50):
             r[key] = r[f"{key}_jam"] = factor[:, None] * np.array(karaim_report.TABLE_2[kind][case.spec.mode])
         r["nees"], r["nis_clean"], r["nis_jam"] = 5.0, 1.0, 1.0
         if case.spec.mode == "vector":
-            r["rms"] *= 10 ** ((case.trial.js_db - 47.5) / 10)
+            r["rms"] *= 10 ** ((case.trial.js_db - 52.5) / 10)
             r["end_2d_m"] = np.where(np.arange(n_runs) < 5, 400.0, 1.0)
         if case.spec.mode == "scalar":
             # Half of the channels go in 20 % of the runs at 32 dB, 60 % at 33.
@@ -159,13 +159,12 @@ def _made_up(n_runs=50):
 
 def test_table_2_stands_beside_the_level_that_matches_and_is_judged_by_the_runs(tmp_path):
     _, runs = _made_up()
-    size = Size(570.0, (180.0, 270.0), 50, SWEEP_DB)
-    js_db = karaim_report.nearest_vector(runs, size)
-    assert js_db == 47.5
+    js_db = karaim_report.nearest_vector(runs, WHOLE)
+    assert js_db == 52.5
     rows = karaim_report.table_2_rows(runs, js_db)
-    assert len(rows) >= 60
+    assert len(rows) == 80
     assert {r["verdict"] for r in rows if "Pos2D" in r["item"]} == {"reproduced"}
-    runs[sweep_name(47.5, "ultra_tight")]["max"] *= 0.01
+    runs[sweep_name(52.5, "ultra_tight")]["max"] *= 0.01
     rows = karaim_report.table_2_rows(runs, js_db)
     bad = [r for r in rows if r["verdict"] == "not reproduced"]
     assert {r["item"].split(": ")[1] for r in bad} == {f"{i} MAX ultra_tight" for i in karaim.ITEMS}
@@ -205,7 +204,7 @@ def test_quick_run_writes_everything(tmp_path):
     assert again == rows
 
 
-ACCEPTANCE = Size(180.0, (60.0, 150.0), 10, (55,))
+ACCEPTANCE = Size(10, (0, 30, 34, 40, 45, 50, 55, 60), (), (), SHORT)
 """Correlator domain, Q = 1, 90 s, ten runs a point: ranges of the estimation note, section 4."""
 
 
@@ -215,10 +214,9 @@ def accepted(tmp_path_factory):
         "RISS alone", "J/S 45 dB vector, no gain", "J/S 40 dB vector, no gain", "J/S 50 dB vector, no gain",
         "no innovation limit", "skips below",
     ]  # fmt: skip
-    size = ACCEPTANCE._replace(levels=(0, 30, 34, 40, 45, 50, 55, 60))
-    cases = [c for c in karaim.twin_cases(size) if sweep_name(c.trial.js_db, c.spec.mode) == c.name]
+    cases = [c for c in karaim.twin_cases(ACCEPTANCE) if sweep_name(c.trial.js_db, c.spec.mode) == c.name]
     cases = [c for c in cases if c.spec.mode != "scalar" or c.trial.js_db in (0, 30, 34, 55)]
-    cases += [c for c in karaim.twin_cases(size) if any(w in c.name for w in wanted)]
+    cases += [c for c in karaim.twin_cases(ACCEPTANCE) if any(w in c.name for w in wanted)]
     results = karaim.compute(tmp_path_factory.mktemp("parts"), cases, [], ACCEPTANCE, 11)
     return {c.name: results[c]["runs"] for c in cases}
 
@@ -245,7 +243,7 @@ def test_ranges_of_the_other_policies(accepted):
     assert _jam(accepted, f"J/S 40 dB {vector}") < 6
     assert 5 < _jam(accepted, f"J/S 45 dB {vector}") < 60
     assert _jam(accepted, f"J/S 50 dB {vector}") > 60
-    trusting = "ultra-tight, the same, no innovation limit"
+    trusting = "ultra-tight, R of 44 dB-Hz for ever, no innovation limit"
     assert 4 < _jam(accepted, f"J/S 45 dB {trusting}") < 30
     assert 10 < _jam(accepted, f"J/S 55 dB {trusting}") < 90
     gated = accepted["J/S 45 dB vector, skips below 17.8 dB-Hz"]

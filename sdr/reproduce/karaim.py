@@ -2,8 +2,8 @@
 
 The paper gives neither J/S, C/N0, loop settings, R policy nor geometry. Here J/S is swept on the multi-satellite twin, and the
 table is set beside the J/S at which our vector receiver is as bad as the published one; then the three receivers run on
-IF samples. Drive: 36 km/h with turns, 8 satellites, C/N0 44 dB-Hz, T 20 ms, jam from 180 to 270 s of 570 s; quick: 60 to
-150 s of 180 s, without IF samples.
+IF samples. Drive: 36 km/h with turns, 8 satellites, C/N0 44 dB-Hz, T 20 ms, 90 s of jamming: from 60 s of 180 s on, where the
+table is sought from 180 s of 570 s on, as published. Quick: 6 runs a point instead of 50, without IF samples.
 
 Every part (50 runs of a point, or one run on samples) is a file in ``parts``, named by a digest of its settings: a command
 that was stopped goes on where it was.
@@ -25,11 +25,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from nav.ultratight import MODES, SteeringSpec
-from sdr.uttwin import EVERY, T_S, Policy, Sky, Trial, drive, replace
+from sdr import uttwin
+from sdr.uttwin import EVERY, T_S, Policy, Sky, Trial
 from sdr.uttwin import run as run_trial
 from signals.jammers import CW, CodeLine, Narrowband
 
-SWEEP_DB = (0, 20, 25, 30, 32.5, 35, 40, 42.5, 45, 47.5, 50, 52.5, 55, 60)
+SWEEP_DB = (0, 20, 25, 30, 32.5, 35, 40, 42.5, 45, 47.5, 50, 52.5, 55, 57.5, 60)
+TABLE_DB = (50, 52.5, 55, 57.5)
+"""J/S at which the published table is sought."""
 QUICK_DB = (0, 20, 30, 40, 45, 50, 55, 60)
 SCALAR_DB = (27, 28, 29, 30, 31, 32, 33, 34, 35, 36)
 """J/S at which the scalar receiver is looked at more closely."""
@@ -39,7 +42,7 @@ RECOVERED_M = 20.0
 FIXED_DBHZ = 44.0
 SAMPLES_JAM_S = (45.0, 135.0)
 SAMPLES_S = 165.0
-SAMPLES_SEEDS = 5
+SAMPLES_SEEDS = 3
 LINE_PRN = 8
 """Satellite of the drive whose strongest line the CW hits."""
 
@@ -63,10 +66,21 @@ ON_SAMPLES = np.dtype(
 """One receiver on IF samples; ``recovered_s`` after the jam, nan: not by the end."""
 
 
+class Drive(NamedTuple):
+    """Length of a run and when it is jammed."""
+
+    span_s: float
+    jam_s: tuple[float, float]
+
+
+SHORT, LONG = Drive(180.0, (60.0, 150.0)), Drive(570.0, (180.0, 270.0))
+
+
 class Case(NamedTuple):
     """One point of the twin."""
 
     name: str
+    span_s: float
     trial: Trial
     spec: SteeringSpec
     policy: Policy = Policy()
@@ -85,14 +99,15 @@ class SamplesCase(NamedTuple):
 class Size(NamedTuple):
     """How much is run."""
 
-    span_s: float
-    jam_s: tuple[float, float]
     n_runs: int
     levels: tuple[float, ...]
+    scalar_levels: tuple[float, ...]
+    table_levels: tuple[float, ...]
+    table_drive: Drive
 
 
-QUICK = Size(180.0, (60.0, 150.0), 6, QUICK_DB)
-WHOLE = Size(570.0, (180.0, 270.0), 50, SWEEP_DB)
+QUICK = Size(6, QUICK_DB, (), (50, 55), SHORT)
+WHOLE = Size(50, SWEEP_DB, SCALAR_DB, TABLE_DB, LONG)
 
 
 def run(out_dir, quick=False, seed=0) -> list[dict]:
@@ -109,7 +124,7 @@ def run(out_dir, quick=False, seed=0) -> list[dict]:
     samples = [] if quick else samples_cases(seed)
     results = compute(out / "parts", cases, samples, size, seed)
     rows = report.rows(results, cases, samples, size)
-    report.figures(out, results, size, sky(size.span_s), samples, seed)
+    report.figures(out, results, size, samples, seed)
     write_table(rows, out, "karaim2020")
     return rows
 
@@ -119,26 +134,28 @@ def run(out_dir, quick=False, seed=0) -> list[dict]:
 
 def twin_cases(size: Size) -> list[Case]:
     """Sweep of the three receivers, the scalar one more closely and without lock detectors, variants."""
-    quiet = Trial(jam_s=size.jam_s)
-    at = lambda js: replace(quiet, js_db=float(js))  # noqa: E731
-    cases = [
-        Case(sweep_name(js, m), at(js), SteeringSpec(mode=m)) for js in size.levels for m in reversed(MODES)
-    ]
-    cases += [
-        Case(sweep_name(js, "scalar"), at(js), SteeringSpec())
-        for js in SCALAR_DB
-        if js not in size.levels and size is not QUICK
-    ]
-    cases += [
-        Case(unguarded_name(js), at(js), SteeringSpec(), guarded=False)
-        for js in size.levels
-        if js in VECTOR_DB
-    ]
-    return cases + _variants(at, replace(quiet, blocked_s=size.jam_s))
+    cases = []
+    for js in size.levels:
+        cases += [
+            _case(sweep_name(js, m), js, SteeringSpec(mode=m), _drive(js, size)) for m in reversed(MODES)
+        ]
+    for js in size.scalar_levels:
+        if js not in size.levels:
+            cases.append(_case(sweep_name(js, "scalar"), js, SteeringSpec(), SHORT))
+    for js in size.table_levels:
+        drive = size.table_drive
+        cases.append(_case(unguarded_name(js), js, SteeringSpec(), drive, guarded=False))
+        spec = SteeringSpec(mode="ultra_tight", limit_sigma=0.0)
+        cases.append(_case(trusting_name(js), js, spec, drive, policy=FIXED))
+    return cases + _variants(size)
 
 
-VECTOR_DB = (45, 47.5, 50, 52.5, 55)
-"""Where the published vector receiver may be sought."""
+def _drive(js_db: float, size: Size) -> Drive:
+    return size.table_drive if js_db in size.table_levels else SHORT
+
+
+def _case(name: str, js_db: float, spec: SteeringSpec, drive: Drive = SHORT, **options) -> Case:
+    return Case(name, drive.span_s, Trial(js_db=float(js_db), jam_s=drive.jam_s), spec, **options)
 
 
 def sweep_name(js_db: float, mode: str) -> str:
@@ -151,30 +168,38 @@ def unguarded_name(js_db: float) -> str:
     return f"J/S {js_db:g} dB scalar without lock detectors"
 
 
-def _variants(at, blocked: Trial) -> list[Case]:
+def trusting_name(js_db: float) -> str:
+    """Name of an ultra-tight point that takes every measurement as if there were no jammer."""
+    return f"J/S {js_db:g} dB ultra-tight, R of {FIXED_DBHZ:g} dB-Hz for ever, no innovation limit"
+
+
+FIXED = Policy(use_gain=False, fixed_dbhz=FIXED_DBHZ)
+
+
+def _variants(size: Size) -> list[Case]:
     """The ultra-tight receiver without GPS, with other error models and other policies for R; other vector receivers."""
     ut, vt = SteeringSpec(mode="ultra_tight"), SteeringSpec(mode="vector")
-    model = lambda kind: SteeringSpec(mode="ultra_tight", model=kind)  # noqa: E731
-    fixed = Policy(use_gain=False, fixed_dbhz=FIXED_DBHZ)
-    trusting = ut.model_copy(update={"limit_sigma": 0.0})
+    full, paper = (SteeringSpec(mode="ultra_tight", model=kind) for kind in ("ecef17", "riss11"))
     slow = Policy(use_gain=False, fast_s=1.0)
+    blocked = Trial(jam_s=SHORT.jam_s, blocked_s=SHORT.jam_s)
     cases = [
-        Case("RISS alone, signals blocked", blocked, ut),
-        Case("full IMU (17 states) alone, signals blocked", blocked, model("ecef17")),
+        Case("RISS alone, signals blocked", SHORT.span_s, blocked, ut),
+        Case("full IMU (17 states) alone, signals blocked", SHORT.span_s, blocked, full),
     ]
     for js in (0, 45, 55):
-        cases += [
-            Case(f"J/S {js} dB, full IMU (17 states)", at(js), model("ecef17")),
-            Case(f"J/S {js} dB, RISS 11 states as printed", at(js), model("riss11")),
-        ]
+        cases.append(_case(f"J/S {js} dB, full IMU (17 states)", js, full))
+        cases.append(_case(f"J/S {js} dB, RISS 11 states as printed", js, paper))
     for js in (45, 50, 55, 60):
-        cases.append(Case(f"J/S {js} dB ultra-tight, R of {FIXED_DBHZ:g} dB-Hz for ever", at(js), ut, fixed))
-    for js in (45, 50, 55, 60):
-        cases.append(Case(f"J/S {js} dB ultra-tight, the same, no innovation limit", at(js), trusting, fixed))
+        cases.append(
+            _case(f"J/S {js} dB ultra-tight, R of {FIXED_DBHZ:g} dB-Hz for ever", js, ut, policy=FIXED)
+        )
+        if js not in size.table_levels:
+            trusting = ut.model_copy(update={"limit_sigma": 0.0})
+            cases.append(_case(trusting_name(js), js, trusting, policy=FIXED))
     for js in (40, 45, 50):
-        cases.append(Case(f"J/S {js} dB vector, no gain, C/N0 over 1 s", at(js), vt, slow))
+        cases.append(_case(f"J/S {js} dB vector, no gain, C/N0 over 1 s", js, vt, policy=slow))
     skips = Policy(use_gain=False, fast_s=1.0, skip_below_dbhz=17.8)
-    return [*cases, Case("J/S 45 dB vector, skips below 17.8 dB-Hz", at(45), vt, skips)]
+    return [*cases, _case("J/S 45 dB vector, skips below 17.8 dB-Hz", 45, vt, policy=skips)]
 
 
 def samples_jammers() -> list[tuple[str, Narrowband | CW]]:
@@ -215,7 +240,7 @@ def compute(directory: Path, cases, samples, size: Size, seed: int) -> Results:
     stop = threading.Event()
     work: list[tuple[Any, Path, Any, tuple]] = []
     for case in cases:
-        path = directory / _file_name(case.name, (case, size.span_s, size.n_runs, seed))
+        path = directory / _file_name(case.name, (case, size.n_runs, seed))
         work.append((case, path, twin_part, (case, size, seed, stop)))
     for one in samples:
         work.append((one, directory / _file_name(one.name, one), samples_part, (one, stop)))
@@ -278,7 +303,7 @@ def twin_part(case: Case, size: Size, seed: int, stop=None) -> dict[str, np.ndar
         if stop is not None and stop.is_set():
             raise Stopped
         sequence = np.random.SeedSequence(seed, spawn_key=(point, i))
-        rows.append(measure(run_trial(sky(size.span_s), case.trial, case.spec, sequence, case.policy, case.guarded),
+        rows.append(measure(run_trial(sky(case.span_s), case.trial, case.spec, sequence, case.policy, case.guarded),
                             case.trial.jam_s))  # fmt: skip
     return {"runs": np.array(rows, RUN)}
 
@@ -294,7 +319,7 @@ def sky(span_s: float) -> Sky:
 
 @lru_cache(maxsize=2)
 def _sky(span_s: float) -> Sky:
-    return Sky(span_s, drive(span_s).start(span_s))
+    return Sky(span_s, uttwin.drive(span_s).start(span_s))
 
 
 def measure(out: np.ndarray, jam_s: tuple[float, float]) -> np.void:
@@ -333,7 +358,7 @@ def samples_scenario(jammer: Narrowband | CW, seed: int):
     changes = {
         "seed": seed,
         "duration_s": SAMPLES_S,
-        "motion": drive(SAMPLES_S, **place),
+        "motion": uttwin.drive(SAMPLES_S, **place),
         "jammer": (jammer,),
     }
     return spec.model_copy(update=changes)

@@ -14,16 +14,17 @@ from sdr.reproduce.karaim import (
     ITEMS,
     RECOVERED_M,
     SAMPLES_JAM_S,
-    VECTOR_DB,
     Case,
     Results,
     SamplesCase,
     Size,
     effective_qs,
+    sky,
     sweep_name,
+    trusting_name,
     unguarded_name,
 )
-from sdr.uttwin import EVERY, T_S, Sky, Trial, replace
+from sdr.uttwin import EVERY, T_S, Trial
 from sdr.uttwin import run as run_trial
 
 TABLE_2 = {
@@ -139,14 +140,13 @@ def nearest_vector(runs, size: Size) -> float:
     def far(js):
         return abs(math.log(np.median(runs[sweep_name(js, "vector")]["rms"][:, POS2D]) / published))
 
-    return min((js for js in size.levels if js in VECTOR_DB), key=far)
+    return min(size.table_levels, key=far)
 
 
 def table_2_rows(runs, js_db: float) -> list[dict]:
     """Table 2 beside ours; the published one is a single drive: reproduced where it lies among 95 % of our runs."""
     found = []
-    for mode in MODES:
-        name = unguarded_name(js_db) if mode == "scalar" else sweep_name(js_db, mode)
+    for label, mode, name in _columns(js_db):
         for kind, key in (("RMS", "rms"), ("MAX", "max")):
             for i, item in enumerate(ITEMS):
                 ours, jam = runs[name][key][:, i], runs[name][key + "_jam"][:, i]
@@ -156,9 +156,19 @@ def table_2_rows(runs, js_db: float) -> list[dict]:
                 note = f"jam only {np.nanmedian(jam):.3g}; 95 % of runs {low:.3g} to {high:.3g}" + _why(
                     mode, claim, low
                 )
-                label = f"Table 2 at J/S {js_db:g} dB: {item} {kind} {mode}"
-                found.append(row(label, claim, *interval(ours), verdict, note))
+                head = f"Table 2 at J/S {js_db:g} dB: {item} {kind} {label}"
+                found.append(row(head, claim, *interval(ours), verdict, note))
     return found
+
+
+def _columns(js_db: float) -> list[tuple[str, str, str]]:
+    """(label, published mode, name of the case) of the columns of table 2."""
+    return [
+        ("scalar", "scalar", unguarded_name(js_db)),
+        ("vector", "vector", sweep_name(js_db, "vector")),
+        ("ultra_tight", "ultra_tight", sweep_name(js_db, "ultra_tight")),
+        ("ultra_tight, R fixed and no limit", "ultra_tight", trusting_name(js_db)),
+    ]
 
 
 def _why(mode: str, claim: float, low: float) -> str:
@@ -175,13 +185,16 @@ def side_by_side(runs, js_db: float, path: Path) -> Path:
     """Table 2 as it is printed, ours beside it, whole run and jam only, medians of runs -> CSV."""
     with path.open("w", newline="", encoding="utf-8") as handle:
         writer = csv.writer(handle)
-        head = [f"{m} {what}" for m in MODES for what in ("published", "ours", "ours in the jam")]
+        columns = _columns(js_db)
+        head = [
+            f"{label} {what}" for label, _, _ in columns for what in ("published", "ours", "ours in the jam")
+        ]
         writer.writerow(["errors", "item", *head])
         for kind, key in (("RMS", "rms"), ("MAX", "max")):
             for i, item in enumerate(ITEMS):
                 line: list[Any] = []
-                for mode in MODES:
-                    r = runs[unguarded_name(js_db) if mode == "scalar" else sweep_name(js_db, mode)]
+                for _, mode, name in columns:
+                    r = runs[name]
                     ours = (np.nanmedian(r[key + suffix][:, i]) for suffix in ("", "_jam"))
                     line += [TABLE_2[kind][mode][i], *(f"{v:.4g}" for v in ours)]
                 writer.writerow([kind, item, *line])
@@ -297,12 +310,12 @@ def _samples_rows(results: Results, samples: list[SamplesCase]) -> list[dict]:
 # -- figures --------------------------------------------------------------------------------------------------------
 
 
-def figures(out: Path, results: Results, size: Size, sky: Sky, samples: list[SamplesCase], seed: int) -> None:
+def figures(out: Path, results: Results, size: Size, samples: list[SamplesCase], seed: int) -> None:
     """Spectrum (figure 12), carriers of two satellites (13, 14), the sweep, the receivers on IF samples; table 2."""
     runs = {c.name: r["runs"] for c, r in results.items() if isinstance(c, Case)}
     side_by_side(runs, nearest_vector(runs, size), out / "table2.csv")
     _figure_12(out)
-    _figures_13_14(out, sky, size, nearest_vector(runs, size), seed)
+    _figures_13_14(out, size, nearest_vector(runs, size), seed)
     _figure_sweep(out, runs, size)
     if samples:
         _figure_samples(out, results, samples)
@@ -322,16 +335,19 @@ def _figure_12(out: Path) -> None:
     save_figure(figure, out, "fig12_spectrum")
 
 
-def _figures_13_14(out: Path, sky: Sky, size: Size, js_db: float, seed: int) -> None:
-    t = (np.arange(sky.n_epochs // EVERY) + 1) * T_S * EVERY
-    trial = replace(Trial(jam_s=size.jam_s), js_db=js_db)
+def _figures_13_14(out: Path, size: Size, js_db: float, seed: int) -> None:
+    span_s, jam_s = size.table_drive
+    t = np.arange(EVERY, round(span_s / T_S) + 1, EVERY) * T_S
+    trial = Trial(js_db=js_db, jam_s=jam_s)
     figure, axes = new_figure(2, 1, sharex=True)
     for ax, watch in zip(axes, (0, 3)):
         for mode in MODES:
-            trace = run_trial(sky, trial, SteeringSpec(mode=mode), seed, guarded=False, watch=watch)[:, 13]
+            trace = run_trial(sky(span_s), trial, SteeringSpec(mode=mode), seed, guarded=False, watch=watch)[
+                :, 13
+            ]
             ax.plot(t, trace, COLORS[mode], lw=0.7, label=mode)
         middle = np.median(trace)  # of the ultra-tight receiver, which keeps it
-        ax.axvspan(*size.jam_s, color="0.5", alpha=0.15)
+        ax.axvspan(*jam_s, color="0.5", alpha=0.15)
         ax.set(ylabel=f"Doppler of satellite {watch + 1} (Hz)", ylim=(middle - 400, middle + 400))
     axes[0].legend(fontsize=8)
     axes[1].set_xlabel("time (s)")
