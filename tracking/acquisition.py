@@ -334,11 +334,15 @@ def _cached_threshold(*arguments):
     return search_threshold(*arguments)
 
 
+@lru_cache(maxsize=4)
+def _one_turn(n):
+    return np.cos(2 * np.pi * np.arange(n) / n)
+
+
 def _plan_threshold(plan, templates, terms, p_fa):
     """Threshold of a search; the correlation of neighbouring code phases is that of the sampled code."""
     power = np.abs(templates[0]).astype(float) ** 2
-    turn = np.exp(2j * np.pi * np.arange(len(power)) / len(power))
-    rho_code = round(float(np.sum(power * turn).real / np.sum(power)), 3)
+    rho_code = round(float(power @ _one_turn(len(power)) / np.sum(power)), 3)
     rho_doppler = round(float(np.sinc(plan.step_hz * plan.hop / plan.fs_hz)), 3)
     return _cached_threshold(p_fa, plan.n * len(plan.bins), terms, rho_code, rho_doppler)
 
@@ -407,14 +411,14 @@ def _window_power(pieces, periods, residual_hz, hop=1):
 
     Windows of ``periods`` code periods, one starting at every ``hop`` periods.
     """
-    n_comp, n_periods, per = pieces.shape
-    span = periods * per
-    flat = pieces.reshape(n_comp, -1)
-    starts = np.arange(0, (n_periods - periods + 1) * per, hop * per)
-    windows = flat[:, starts[:, None] + np.arange(span)].reshape(-1, span)
-    t = (np.arange(span) + 0.5) / (_PIECES_PER_MS * 1e3)
-    turn = np.exp(-2j * np.pi * np.outer(t, np.atleast_1d(residual_hz)))
-    return np.sum(np.abs(windows @ turn) ** 2, axis=0), len(windows)
+    n_comp, _, per = pieces.shape
+    residual_hz = np.atleast_1d(np.asarray(residual_hz, float))
+    power = np.zeros(len(residual_hz))
+    piece_s = 1e-3 / _PIECES_PER_MS
+    count = kernels.window_power(
+        pieces.reshape(n_comp, -1), periods * per, hop * per, piece_s, residual_hz, power
+    )
+    return power, count
 
 
 def _noise_powers(follower, doppler_hz, lag, periods, count, stop=None, residual_hz=0.0):

@@ -174,3 +174,25 @@ def subtract_code(x, table, samples_per_chip, length, phase_chips, chips_per_sam
                     re, im, energy = re + s, im + t, energy + e
             if energy > 0:
                 re, im, energy = re / energy, im / energy, 0.0
+
+
+@nb.njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"})
+def window_power(pieces, span, step, piece_s, residual_hz, out):
+    """out[f] = sum over windows of |sum_k pieces[c, first + k] exp(-2 pi i f (k + 1/2) piece_s)|^2; returns their number.
+
+    Windows of ``span`` pieces begin at every ``step`` pieces of each component; ``pieces`` complex128 (components, n).
+    """
+    turn, count = np.empty(span, np.complex128), 0
+    for f in range(len(out)):
+        for k in range(span):
+            turn[k] = np.exp(-2j * np.pi * residual_hz[f] * ((k + 0.5) * piece_s))
+        total, count = 0.0, 0
+        for c in range(pieces.shape[0]):
+            for first in range(0, pieces.shape[1] - span + 1, step):
+                z = 0.0 + 0.0j
+                for k in range(span):
+                    z += pieces[c, first + k] * turn[k]
+                total += z.real * z.real + z.imag * z.imag
+                count += 1
+        out[f] = total
+    return count
