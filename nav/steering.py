@@ -46,8 +46,8 @@ ISB_SIGMA_M = 5.0
 """Of an inter-system bias that a scalar fix gave."""
 LEFT_OUT = 1e12
 """Factor on the variances of a satellite that a monitor excludes: it weighs nothing and is still steered."""
-REPORT_EVERY = 5
-"""Epochs between new values of the slower columns of ``Steering.record``."""
+REPORT_S = 0.1
+"""Between new values of the slower columns of ``Steering.record``."""
 REFRESH_S = 1.0
 """Atmosphere and ephemerides are renewed this often."""
 MISSING_S = 5.0
@@ -79,6 +79,12 @@ class Sensors:
             known = at < self.imu.size
             out[at[known], 7] = self.barometer["height_m"][known]
         return out
+
+
+def _time_of_week(ms, frac_s):
+    """(whole s, remainder) of a receiver time in (whole ms, remainder)."""
+    whole = ms // 1000
+    return float(whole % SECONDS_PER_WEEK), (ms - whole * 1000) * 1e-3 + frac_s
 
 
 class Steering:
@@ -341,9 +347,7 @@ class Steering:
         self._next_refresh = self.sample + round(REFRESH_S * self.fs_hz)
 
     def _receiver_tow(self, sample):
-        ms, frac_s = self._clock.read(sample)
-        whole = ms // 1000
-        return float(whole % SECONDS_PER_WEEK), (ms - whole * 1000) * 1e-3 + frac_s
+        return _time_of_week(*self._clock.read(sample))
 
     # -- one epoch ----------------------------------------------------------------------------------------------
 
@@ -353,9 +357,8 @@ class Steering:
         ``epochs``, ``counts``: of ``Tracker.process``; ``channels_state`` (C,) STATE_* of the tracker's channels;
         ``ephemerides``: called once a second for the newest EPHEMERIS rows. Returns AIDING (C,).
         """
-        for i in np.flatnonzero(self.active):
-            if channels_state[self.slot[i]] != STATE_LOCKED:
-                self.drop(int(i))
+        for i in np.flatnonzero(self.active & (channels_state[self.slot] != STATE_LOCKED)):
+            self.drop(int(i))
         if sample >= self._next_refresh:
             self.refresh(ephemerides())
         commands = np.zeros(len(channels_state), AIDING)
@@ -371,19 +374,19 @@ class Steering:
         sensors = self._sensors(sample)
         dt_s = self.dt_s if sensors.shape[0] > 1 or self._table.size else (sample - self.sample) / self.fs_hz
         ms, frac_s = self._clock.read(sample)
-        tow, tow_frac = self._receiver_tow(sample)
-        log = f.slot()
-        log["t_s"][0] = sample / self.fs_hz
+        tow, tow_frac = _time_of_week(ms, frac_s)
+        log, delay = f.slot(sample / self.fs_hz), self.delay + self.bias
         nis, rows, seen = kernels.navigation_epoch(
-            f.code, f.x, f.p, sensors, dt_s, f.filter_s, f.rates, f.q, self.spec.limit_sigma, self.spec.fast_cn0_s,
+            f.code, f.x, f.p, sensors, dt_s, 1.0 / self.spec.update_hz, f.filter_s, f.rates, f.q, self.spec.limit_sigma, self.spec.fast_cn0_s,
             self.spec.slow_cn0_s, self.spec.code_floor_m, self.spec.rate_floor_mps, sample, self.fs_hz, ms, frac_s, tow,
             tow_frac, self.orbit, self.toe_toc_tgd, self.active, self.slot, self.second, self.period_s,
-            self.delay + self.bias, self.delay_rate, self.inflate, self._tables, self.which, epochs, counts, f.power, f.cn0,
-            f.rho, f.rate, f.accel, f.los, f.f, log["phi"][0], log["qd"][0], log["h"][0], log["r"][0], log["var"][0], f.own,
-            log["used"][0], log["k"][0], log["s"][0], log["p"][0], f.dx, commands,
+            delay, self.delay_rate, self.inflate, self._tables, self.which, epochs, counts, f.power, f.cn0,
+            f.rho, f.rate, f.accel, f.los, f.f, log.phi, log.qd, log.h, log.r, log.var, f.own, log.used, log.k, log.s, log.p, f.dx,
+            commands,
         )  # fmt: skip
         # Rows that weigh nothing are no degrees of freedom.
-        rows -= int(np.sum((f.own > 0) & (self.inflate >= LEFT_OUT)))
+        if self.inflate.max() >= LEFT_OUT:
+            rows -= int(np.sum((f.own > 0) & (self.inflate >= LEFT_OUT)))
         f.nis, f.n_rows = nis, rows
         self.sample = sample
         return nis, rows, seen
@@ -407,13 +410,13 @@ class Steering:
     def _judge(self, sample, nis, rows):
         """State from what is seen and how well the next interval is known."""
         f = self.filter
-        usable = int(np.sum(f.cn0[self.active] > USABLE_CN0_HZ))
         if rows:
             self._ratio += (min(nis / rows, 25.0) - self._ratio) / self.spec.update_hz
         sigma = np.zeros(2)
-        kernels.predicted_sigma(f.code, f.x, f.p, f.los, self.active, sigma)
+        usable, missing, heard = kernels.outlook(
+            f.code, f.x, f.p, f.los, self.active, f.power, f.cn0, USABLE_CN0_HZ, sigma
+        )
         self.sigma, self.usable = sigma, usable
-        missing, heard = f.missing(self.active)
         self._missing_s = self._missing_s + 1.0 / self.spec.update_hz if missing > heard > 0 else 0.0
         if usable >= 1:
             self.state, self._coast_since = STEERED, -1
@@ -421,7 +424,7 @@ class Steering:
             self.state = COASTING
             self._coast_since = sample if self._coast_since < 0 else self._coast_since
         why = ""
-        if not np.isfinite(sigma).all() or not np.isfinite(np.concatenate(f.position())).all():
+        if not (math.isfinite(sigma[0]) and math.isfinite(sigma[1])):
             why = "the filter's state is not finite"
         elif sigma[0] > self.spec.release_code_m:
             why = (
@@ -437,13 +440,17 @@ class Steering:
             self._sigma_2d = math.inf
             self.release(why)
 
+    def due(self, every_s: float) -> bool:
+        """Whether this epoch is one of those ``every_s`` apart."""
+        return self.filter.epochs % max(1, round(every_s * self.spec.update_hz)) == 0
+
     def _report(self, sample, nis, rows):
         r = self.record[0]
         r["sample_index"], r["t_s"], r["state"] = sample, sample / self.fs_hz, self.state
         r["nis"], r["rows"] = nis, rows
         r["sigma_range_m"], r["sigma_rate_mps"] = self.sigma
         r["n_steered"], r["n_used"] = int(self.active.sum()), self.usable
-        if self.filter is not None and self.filter.epochs % REPORT_EVERY == 0:
+        if self.filter is not None and self.due(REPORT_S):
             f, cn0 = self.filter, np.sort(self.filter.cn0[self.active])
             r["sigma_2d_m"] = kernels.horizontal_sigma(f.code, f.x, f.p)
             r["cn0_median_dbhz"] = 10.0 * math.log10(max(float(cn0[cn0.size // 2]), 1.0)) if cn0.size else 0.0

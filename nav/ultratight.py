@@ -59,7 +59,7 @@ class SteeringSpec(BaseModel):
     """Channels on their own loops, steered by the position filter, or by it with an IMU."""
     model: Literal["kinematic", "riss_sf", "riss11", "ecef17", "pinson13"] | None = None
     """None: kinematic for vector, riss_sf for ultra_tight. The two RISS forms need an odometer, pinson13 a barometer."""
-    update_hz: Annotated[float, Field(ge=5, le=50)] = 50.0
+    update_hz: Annotated[float, Field(ge=5, le=100)] = 50.0
     """Rate at which the filter commands the channels."""
     compare: tuple[Literal["scalar", "vector", "ultra_tight"], ...] = ()
     """Run these receivers side by side on the same samples."""
@@ -302,12 +302,14 @@ class Filter:
         self.own = np.zeros(m)
         self.nis, self.n_rows, self.epochs, self._first = math.nan, 0, 0, 0
         self._ring = empty_log(log_length, n, m)
+        self._views = [EpochLog(*row) for row in zip(*self._ring)]
 
-    def slot(self) -> dict[str, np.ndarray]:
-        """Views of the log's next row."""
+    def slot(self, t_s: float) -> EpochLog:
+        """Views of the log's next row, of time ``t_s``."""
         i = self.epochs % self._ring.t_s.size
         self.epochs += 1
-        return {name: getattr(self._ring, name)[i : i + 1] for name in self._ring._fields}
+        self._ring.t_s[i] = t_s
+        return self._views[i]
 
     def log(self, n_epochs: int | None = None) -> EpochLog:
         """The last ``n_epochs`` epochs, oldest first (copies)."""
@@ -323,7 +325,7 @@ class Filter:
     def last(self) -> EpochLog:
         """The last epoch (views)."""
         i = (self.epochs - 1) % self._ring.t_s.size
-        return EpochLog(*(array[i] for array in self._ring))
+        return self._views[i]._replace(t_s=self._ring.t_s[i])
 
     def correct(self, dx: np.ndarray | None, p: np.ndarray | None) -> None:
         """Between two epochs: inject dx = true - estimate, replace the covariance; what was logged is another filter's."""
@@ -343,17 +345,6 @@ class Filter:
         """Clock bias (m) and drift (m/s)."""
         cb, cd = kernels.clock_columns(self.code)
         return float(self.x[cb]), float(self.x[cd])
-
-    def missing(self, active) -> tuple[int, int]:
-        """Active channels that should stand out of the noise (their own strength is remembered) and do not; those that do."""
-        power = self.power[active]
-        noise = power[:, kernels.N_FAST]
-        should = power[:, kernels.SIGNAL] > kernels.STRONG * noise
-        there = (
-            np.minimum(power[:, kernels.P_FAST], power[:, kernels.P_SLOW]) > (1.0 + kernels.STRONG) * noise
-        )
-        gone = power[:, kernels.P_FAST] < 4.0 * noise
-        return int(np.sum(should & gone)), int(np.sum(should & there))
 
     def covariance(self) -> np.ndarray:
         """Covariance of the ECEF position (3, 3), m^2."""

@@ -67,10 +67,6 @@ OBSERVED_HZ = 1.0
 STRONG = 10.0
 """C/N0 T above which the signal's own power is learnt."""
 
-SLOW_HZ_S = 25.0
-"""Doppler rate below which a command keeps its frequency constant."""
-LEAD_S = 0.02
-"""From a command to the middle of the integrations it governs, on average, at 50 Hz and 20 ms."""
 TABLE_LOW_DB, TABLE_STEP_DB = -20.0, 0.5
 """Grid of the discriminator table: C/N0 T in dB; columns code gain, code variance (chips^2), frequency gain and
 variance of frequency x T / 2 (cycles^2)."""
@@ -644,12 +640,14 @@ def observe(seen, span_s, z, gain_code, gain_rate, off_m, off_mps, rho, rate, be
 
 
 @njit(cache=True, nogil=True)
-def steer(active, slot, period_s, sample, rx_ms, rx_frac_s, rho, rate, accel, lead_s, commands):
-    """NCO commands from ``sample`` on: code phase, Doppler and its rate.
+def steer(active, slot, period_s, sample, rx_ms, rx_frac_s, rho, rate, accel, every_s, commands):
+    """NCO commands from ``sample`` on, the next ones ``every_s`` later: code phase, Doppler and its rate.
 
-    A slow rate is folded into the Doppler ``lead_s`` ahead, where the integrations that this command governs have their
-    middle: within ``SLOW_HZ_S`` that is exact to 0.25 Hz, and a carrier of constant frequency is cheaper to correlate.
+    A rate that changes the Doppler by less than 0.25 Hz in half of that time is folded into it, ``every_s``/2 + 10 ms ahead,
+    where integrations of 20 ms that this command governs have their middle on average: a carrier of constant frequency is
+    cheaper to correlate.
     """
+    lead_s, slow_hz_s = 0.5 * every_s + 0.01, 0.5 / every_s
     for c in range(active.size):
         if not active[c]:
             continue
@@ -660,13 +658,13 @@ def steer(active, slot, period_s, sample, rx_ms, rx_frac_s, rho, rate, accel, le
         cmd.code_phase_chips = (t - math.floor(t / period_s[c]) * period_s[c]) * CHIP_RATE_HZ
         cmd.doppler_hz = -rate[c] / WAVELENGTH_M
         cmd.doppler_rate_hz_s = -accel[c] / WAVELENGTH_M
-        if abs(cmd.doppler_rate_hz_s) < SLOW_HZ_S:
+        if abs(cmd.doppler_rate_hz_s) < slow_hz_s:
             cmd.doppler_hz += lead_s * cmd.doppler_rate_hz_s
             cmd.doppler_rate_hz_s = 0.0
 
 
 @njit(cache=True, nogil=True)
-def navigation_epoch(model, x, p, sensors, dt_s, filter_s, rates, q_diag, limit, fast_s, slow_s, floor_m, floor_mps,
+def navigation_epoch(model, x, p, sensors, dt_s, every_s, filter_s, rates, q_diag, limit, fast_s, slow_s, floor_m, floor_mps,
                      sample, fs_hz, rx_ms, rx_frac_s, tow_whole, tow_frac, orbit, toe_toc_tgd, active, slot, second,
                      period_s, delay, delay_rate, inflate, tables, which, epochs, counts, power, cn0, rho, rate, accel,
                      los, f, phi, qd, h, z, var, own, used, k, s, p_prior, dx, commands):  # fmt: skip
@@ -710,7 +708,7 @@ def navigation_epoch(model, x, p, sensors, dt_s, filter_s, rates, q_diag, limit,
         model, x, active, second, sat_pos, sat_vel, sat_acc, clock, clock_rate, delay, delay_rate, rho, rate, accel, los
     )  # fmt: skip
     observe(seen, span_s, z, gain_code, gain_rate, off_m, off_mps, rho, rate, before_m, before_mps, power)
-    steer(active, slot, period_s, sample, rx_ms, rx_frac_s, rho, rate, accel, LEAD_S, commands)
+    steer(active, slot, period_s, sample, rx_ms, rx_frac_s, rho, rate, accel, every_s, commands)
     tracked = 0
     for c in range(count):
         tracked += seen[c] > 0
@@ -718,17 +716,30 @@ def navigation_epoch(model, x, p, sensors, dt_s, filter_s, rates, q_diag, limit,
 
 
 @njit(cache=True, nogil=True)
-def predicted_sigma(model, x, p, los, active, out):
-    """Largest standard deviations of predicted range (m) and rate (m/s) over the active channels into ``out`` (2,)."""
+def outlook(model, x, p, los, active, power, cn0, usable_hz, sigma):
+    """What the filter sees and how well it knows the next interval.
+
+    ``sigma`` (2,): largest standard deviations of predicted range (m) and rate (m/s) over the active channels, NaN when the
+    position is not finite. Returns the numbers of active channels above ``usable_hz``; of those that should stand out of the
+    noise (their own strength is remembered) and do not; of those that should and do.
+    """
     n = p.shape[0]
-    tp, tv = np.empty((3, n)), np.empty((3, n))
+    tp, tv, pos, vel = np.empty((3, n)), np.empty((3, n)), np.empty(3), np.empty(3)
     maps(model, x, tp, tv)
+    position_velocity(model, x, pos, vel)
     ib, idr = clock_states(model)
     row = np.empty(n)
-    out[:] = 0.0
+    sigma[:] = 0.0
+    usable = missing = heard = 0
+    finite = math.isfinite(pos[0] + pos[1] + pos[2] + vel[0] + vel[1] + vel[2])
     for c in range(active.size):
         if not active[c]:
             continue
+        usable += cn0[c] > usable_hz
+        noise, fast = power[c, N_FAST], power[c, P_FAST]
+        if power[c, SIGNAL] > STRONG * noise:
+            missing += fast < 4.0 * noise
+            heard += min(fast, power[c, P_SLOW]) > (1.0 + STRONG) * noise
         for kind in range(2):
             t = tp if kind == 0 else tv
             for j in range(n):
@@ -738,7 +749,11 @@ def predicted_sigma(model, x, p, los, active, out):
             for i in range(n):
                 for j in range(n):
                     v += row[i] * p[i, j] * row[j]
-            out[kind] = max(out[kind], math.sqrt(max(v, 0.0)))
+            sigma[kind] = max(sigma[kind], math.sqrt(max(v, 0.0)))
+            finite = finite and math.isfinite(v)
+    if not finite:
+        sigma[:] = math.nan
+    return usable, missing, heard
 
 
 @njit(cache=True, nogil=True)

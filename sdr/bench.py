@@ -18,6 +18,7 @@ import numpy as np
 
 from sdr import iffile, scenario
 from sdr.receiver import Receiver
+from sdr.watch import WatchSpec
 from signals.source import SyntheticSource
 from tracking.acquisition import AcquisitionSpec, acquire, slab_samples
 from tracking.channel import TrackingSpec
@@ -26,6 +27,7 @@ FS_HZ = 4.0e6
 LUT = 1024
 ROUNDS = 5
 SECONDS = 4.0
+WATCHED_S = 20.0
 SKY = """
 name = "bench"
 seed = 7
@@ -92,12 +94,19 @@ def bench(*, quick: bool = False, quiet: bool = False) -> dict[str, Any]:
     say(
         f"  synthesis, 10 sat     {synth / 1e6:6.0f} satellite*Msps   {synth_ratio:5.1f}; CBOC {cboc / 1e6:.0f} component*Msps"
     )
+    share = _median([_monitors() for _ in range(rounds)])
+    say(f"  live monitors         {100 * share:6.1f} % of the tracking of 8 channels with 35 taps")
     found_s = _median([_acquisition() for _ in range(rounds)])
     say(f"  acquisition 32 PRN    {found_s:6.3f} s")
     chain, compute = _chain(20.0 if quick else 60.0)
     say(
         f"  whole chain, 8 ch     {chain / 1e6:6.0f} channel*Msps, file to position ({compute:.1f} times real time)"
     )
+    ratio, steered = _steered(rounds)
+    say(f"  ultra-tight, 10 ch    {steered:6.1f} times real time, costs {ratio:.2f} scalar receivers")
+    shares = {name: _integrity(name) for name in (() if quick else ("integrity-ramp", "integrity-ut-ramp"))}
+    for name, share in shares.items():
+        say(f"  integrity monitors    {100 * share:6.1f} % of the receiver's time ({name})")
     speedup = _median([_threads() for _ in range(rounds)])
     say(f"  2 threads             {speedup:6.2f} of two independent processes")
     return {
@@ -107,8 +116,10 @@ def bench(*, quick: bool = False, quiet: bool = False) -> dict[str, Any]:
         "track_e1_pilot_data_cost": five / pilot,
         "synth_satellite_msps_per_core": synth / 1e6,
         "synth_cboc_component_cost": (synth / cboc),
+        "monitors_share_of_tracking": share,
         "acquire_32_prn_s": found_s,
         "threads_2_speedup": speedup,
+        "integrity_share": shares,
         "ratio_to_reference": {
             "track_e_p_l": one_ratio,
             "track_35_taps": wide_ratio,
@@ -116,6 +127,8 @@ def bench(*, quick: bool = False, quiet: bool = False) -> dict[str, Any]:
             "synth": synth_ratio,
         },
         "real_time_factor_8_channels": compute,
+        "real_time_factor_ultra_tight": steered,
+        "ultra_tight_over_scalar": ratio,
         "cpu": cpu_name(),
         "text": "",
     }
@@ -237,6 +250,43 @@ def _acquisition() -> float:
     return time.process_time() - begin
 
 
+def _monitors() -> float:
+    """CPU of FFT and GLRT every epoch, AR residual every epoch and AR refit once a second, over that of tracking."""
+    source = _sky(WATCHED_S, 8, ["L1CA"])
+    first = source.read(slab_samples("L1CA", FS_HZ))[1]
+    rows = acquire(first, 0, FS_HZ, 0.0, "L1CA", None, AcquisitionSpec())
+    taps = {"count": 35, "spacing_chips": 0.65}
+    tracker = TrackingSpec.model_validate({"l1ca": {"taps": taps}}).start(FS_HZ)
+    for row in rows[rows["acquired"]]:
+        tracker.add(row)
+    watches = [
+        WatchSpec.model_validate({"name": d["kind"], "detector": d, "settle_s": 0.5, "training_s": 4.0, "threshold": 1e9})
+        for d in (
+            {"kind": "FFT"}, {"kind": "GLRT"}, {"kind": "AR", "hop_s": 0.02}, {"kind": "AR", "form": "refit", "hop_s": 1.0},
+        )
+    ]  # fmt: skip
+    runs: list[Any] = [w.start(FS_HZ) for w in watches]
+    nominal = taps["spacing_chips"] * (np.arange(taps["count"]) - taps["count"] // 2)
+    spent = np.zeros(2)
+    iq, n0 = first, 0
+    while iq.shape[1]:
+        marks = [time.thread_time()]
+        epochs, counts, corr = tracker.process(n0, iq)
+        marks.append(time.thread_time())
+        for c in np.flatnonzero(counts):
+            k = tracker.window(c)
+            for run in runs:
+                run(
+                    "L1CA", int(tracker.channels["prn"][c]), epochs[c, : counts[c]], corr[c, : counts[c], :k],
+                    (nominal, tracker.taps_chips(c)[:k]), "BPSK",
+                )  # fmt: skip
+        marks.append(time.thread_time())
+        if n0 > (WATCHED_S - 10.0) * FS_HZ:
+            spent += np.diff(marks)
+        n0, iq = source.read(round(0.2 * FS_HZ))
+    return float(spent[1] / spent[0])
+
+
 def _chain(duration_s: float) -> tuple[float, float]:
     """File to position: channel samples per second of CPU, and the real-time factor of the whole run."""
     spec = _scenario(duration_s, 8, ["L1CA"])
@@ -257,6 +307,90 @@ def _chain(duration_s: float) -> tuple[float, float]:
                     break
             elapsed = time.process_time() - begin
     return samples / elapsed, duration_s / elapsed
+
+
+STEERED_FROM_S, STEERED_S = 30.0, 8.0
+"""The ultra-tight receiver has taken over by then; how long it is timed."""
+
+
+class _Memory:
+    """The samples of a source, read once and kept."""
+
+    def __init__(self, source: Any) -> None:
+        self.fs_hz, self.if_hz, self.n_samples = source.fs_hz, source.if_hz, source.n_samples
+        self.iq, self.position = source.read(source.n_samples)[1], 0
+
+    def read(self, n: int) -> tuple[int, np.ndarray]:
+        n0, self.position = self.position, min(self.position + n, self.n_samples)
+        return n0, self.iq[:, n0 : self.position]
+
+
+def _steered(rounds: int) -> tuple[float, float]:
+    """CPU time of an ultra-tight receiver (100 Hz IMU and odometer, 50 Hz updates) over that of a scalar one, in turn on the
+    same samples of 10 satellites, once it steers; and its real-time factor.
+    """
+    sky = [
+        "jammer=[]",
+        "sky.max_satellites=10",
+        "sky.elevation_mask_deg=5",
+        f"duration_s={STEERED_FROM_S + STEERED_S}",
+    ]
+    spec = scenario.load("drive-jam", sky)[0]
+    memory, sensors = _Memory(scenario.source(spec, threads=2)), scenario.sensors(spec)
+
+    def seconds(mode: str) -> float:
+        memory.position = 0
+        steering = spec.receiver.steering.with_mode(mode)
+        receiver = Receiver(spec.receiver.model_copy(update={"steering": steering}), memory, sensors)
+        begin = 0.0
+        for outcome in receiver:
+            if begin == 0.0 and outcome.n_end >= STEERED_FROM_S * memory.fs_hz:
+                begin = time.thread_time()
+        return time.thread_time() - begin
+
+    seconds("scalar"), seconds("ultra_tight")
+    pairs = [(seconds("ultra_tight"), seconds("scalar")) for _ in range(rounds)]
+    return _median([a / b for a, b in pairs]), STEERED_S / _median([a for a, _ in pairs])
+
+
+class _Clocked:
+    """Any object, with the CPU seconds of this thread that calls of it (of ``methods``, if given) have taken."""
+
+    def __init__(self, what: Any, methods: tuple[str, ...] = ()) -> None:
+        self._what, self._methods, self.seconds = what, methods, 0.0
+
+    def __getattr__(self, name: str) -> Any:
+        value = getattr(self._what, name)
+        if not callable(value) or (self._methods and name not in self._methods):
+            return value
+        return lambda *a, **k: self(*a, of=value, **k)
+
+    def __call__(self, *args: Any, of: Any = None, **named: Any) -> Any:
+        begin = time.thread_time()
+        result = (of or self._what)(*args, **named)
+        self.seconds += time.thread_time() - begin
+        return result
+
+
+def _integrity(name: str) -> float:
+    """Share of the integrity monitors, and of the log kept for them, in the receiver's CPU time; the last 10 of 50 s."""
+    spec, _ = scenario.load(name, ["duration_s=50.0", "fault=[]"])
+    source = _Clocked(scenario.source(spec), ("read",))
+    receiver: Any = Receiver(spec.receiver, source, scenario.sensors(spec))
+    parts = [_Clocked(receiver.integrity)]
+    receiver.integrity = parts[0]
+    if receiver.navigator.log is not None:
+        parts.append(_Clocked(receiver.navigator.log, ("predicted", "updated")))
+        receiver.navigator.log = parts[1]
+    begin, before = 0.0, 0.0
+    for outcome in receiver:
+        if begin == 0.0 and outcome.n_end >= 40.0 * receiver.fs_hz:
+            begin = time.process_time()
+            before = source.seconds
+            for part in parts:
+                part.seconds = 0.0
+    whole = time.process_time() - begin - (source.seconds - before)
+    return sum(part.seconds for part in parts) / whole
 
 
 def _track_all(threads: int, barrier: Any = None) -> float:

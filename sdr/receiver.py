@@ -31,12 +31,14 @@ SEARCHED = {"G": "L1CA", "E": "E1C"}
 """Signal that is searched for each system; it also names the component that carries the loops."""
 ENOUGH = 4
 """Satellites tracked below which everything is searched again and again."""
-SOLUTION_EVERY = 5
-"""Steered positions are reported every so many navigation epochs."""
+SOLUTION_S = 0.1
+"""Steered positions are reported this often."""
 DECODE_EVERY = 10
 """Most slabs whose symbols are decoded together; at navigation epochs all are."""
-TAKE_EVERY = 25
-"""New channels are put under command every so many navigation epochs."""
+TAKE_S = 0.5
+"""New channels are put under command this often."""
+SECOND_LOOK = 8
+"""Satellites that came nearest their thresholds in the first search and are searched once more."""
 WIDEST = 4.0
 """The Doppler range is doubled, up to so many times the one asked for, while too few satellites are found."""
 RETRY_S = 1.0
@@ -105,6 +107,7 @@ class Receiver:
         self._undecoded = 0
         self._recent: list[tuple[int, np.ndarray]] = []
         self._lost: list[tuple[str, int]] = []
+        self._nearness: dict[tuple[str, int], float] = {}
         self._next_search = self._next_retry = self._full_searches = self._turn = 0
         self._wanted = self._dwell_samples()
 
@@ -165,9 +168,10 @@ class Receiver:
     def _search(self, n0: int, iq: np.ndarray) -> np.ndarray:
         """Look for satellites that are not tracked, when the time has come and enough samples are at hand.
 
-        A search of everything costs as much as tracking for a minute or more. So all is searched at the start, once
-        more a little later, and every ``search_every_s`` while fewer than ``ENOUGH`` satellites are tracked; else
-        one satellite in turn every ``search_one_every_s``, those lost a moment ago first.
+        A search of everything costs as much as tracking for ten seconds or more. So all is searched at the start, and
+        every ``search_every_s`` while fewer than ``ENOUGH`` satellites are tracked; else the ``SECOND_LOOK`` that came
+        nearest their thresholds once more a little later, then one satellite in turn every ``search_one_every_s``.
+        Those lost a moment ago come first.
         """
         n_end = n0 + iq.shape[1]
         self._drop_lost()
@@ -187,8 +191,11 @@ class Receiver:
         return self._acquire(first, samples, self._due(n_end))
 
     def _drop_lost(self) -> None:
+        lost = self.tracker.channels["state"] == STATE_LOST
+        if not lost.any():
+            return
         for key, c in list(self.channel_of.items()):
-            if self.tracker.channels["state"][c] == STATE_LOST:
+            if lost[c]:
                 self.tracker.release(c)
                 del self.channel_of[key]
                 self._lost.append(key)
@@ -209,6 +216,9 @@ class Receiver:
         self._full_searches += 1
         if self._full_searches <= 2 or len(self.channel_of) < ENOUGH:
             self._next_search = n_end + round(self.spec.search_every_s * self.fs_hz)
+            if self._full_searches == 2 and len(self.channel_of) >= ENOUGH:
+                missing.sort(key=lambda key: -self._nearness.get(key, 0.0))
+                return missing[:SECOND_LOOK]
             return missing
         self._next_search = n_end + round(self.spec.search_one_every_s * self.fs_hz)
         self._turn += 1
@@ -228,6 +238,9 @@ class Receiver:
             self.searched[signal] = sorted({*self.searched.get(signal, ()), *prns})
             rows = acquire(
                 samples, first, self.fs_hz, self.source.if_hz, signal, prns, spec, self.spec.codes_path
+            )
+            self._nearness.update(
+                zip(((signal, p) for p in prns), (rows["statistic"] / rows["threshold"]).tolist())
             )
             for row in rows[rows["acquired"]]:
                 self._decode()  # before a channel changes hands
@@ -299,6 +312,12 @@ class Receiver:
         spec = self.spec.steering
         if spec.mode == "scalar":
             return None
+        per_fix = spec.update_hz / self.spec.navigation.rate_hz
+        if per_fix < 1 or abs(per_fix - round(per_fix)) > 1e-9:
+            raise ValueError(
+                f"receiver.steering.update_hz = {spec.update_hz:g} is not a multiple of receiver.navigation.rate_hz = "
+                f"{self.spec.navigation.rate_hz:g}: positions must fall on updates"
+            )
         tracking = self.spec.tracking
         if tracking.l1ca.integration_ms * 1e-3 > 1.001 / spec.update_hz:
             raise ValueError(
@@ -331,9 +350,9 @@ class Receiver:
             self.integrity.gather(steering)
         if steering.filter is None:
             return
-        if self._week is not None and steering.filter.epochs % SOLUTION_EVERY == 0:
+        if self._week is not None and steering.due(SOLUTION_S):
             out.solutions.append(steering.solution(self._week))
-        if steering.filter.epochs % TAKE_EVERY == 0:
+        if steering.due(TAKE_S):
             steering.meet(self.navigator.handover()[2])
             steering.take(self._phase_locked(), self.telemetry.ephemerides())
 
