@@ -217,8 +217,8 @@ class Receiver:
         if self._full_searches <= 2 or len(self.channel_of) < ENOUGH:
             self._next_search = n_end + round(self.spec.search_every_s * self.fs_hz)
             if self._full_searches == 2 and len(self.channel_of) >= ENOUGH:
-                missing.sort(key=lambda key: -self._nearness.get(key, 0.0))
-                return missing[:SECOND_LOOK]
+                rest = sorted(set(missing) - set(lost), key=lambda key: (-self._nearness.get(key, 0.0), key))
+                return lost + rest[:SECOND_LOOK]
             return missing
         self._next_search = n_end + round(self.spec.search_one_every_s * self.fs_hz)
         self._turn += 1
