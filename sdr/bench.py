@@ -273,9 +273,9 @@ def _monitors() -> float:
         marks = [time.thread_time()]
         epochs, counts, corr = tracker.process(n0, iq)
         marks.append(time.thread_time())
-        for c in np.flatnonzero(counts):
-            k = tracker.window(c)
-            for run in runs:
+        for run in runs:
+            for c in np.flatnonzero(counts):
+                k = tracker.window(c)
                 run(
                     "L1CA", int(tracker.channels["prn"][c]), epochs[c, : counts[c]], corr[c, : counts[c], :k],
                     (nominal, tracker.taps_chips(c)[:k]), "BPSK",

@@ -32,17 +32,20 @@ PROTECTION = np.dtype(
 _CODES = 256
 
 
-@lru_cache(maxsize=_CODES)
 def split(name: str) -> tuple[bytes, int]:
     """G07 -> (b"G", 7)."""
     return name[:1].encode(), int(name[1:])
 
 
+@lru_cache(maxsize=256)
+def _columns(names: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
+    return np.array([split(n)[0] for n in names], "S1"), np.array([split(n)[1] for n in names], np.int32)
+
+
 def found(names, sample: int, t_s: float, value, threshold, estimate_m=np.nan, rivals=b"") -> np.ndarray:
     """INTEGRITY rows of satellites ``names``; the rest are columns or scalars."""
     rows = np.zeros(len(names), INTEGRITY)
-    for row, name in zip(rows, names):
-        row["system"], row["prn"] = split(name)
+    rows["system"], rows["prn"] = _columns(tuple(names))
     rows["sample_index"], rows["t_s"], rows["rivals"] = sample, t_s, rivals
     rows["value"], rows["threshold"], rows["estimate_m"] = value, threshold, estimate_m
     return rows

@@ -10,6 +10,7 @@ import math
 import numpy as np
 
 from monitors.bias_bank import BiasBank, BiasReport, parity_weight
+from monitors.normal_points import NormalPoints
 from monitors.protection import chi2_limit, quick_levels
 from nav.frames import geodetic_from_ecef, rotation_enu_to_ecef
 from nav.navigator import Snapshot
@@ -29,7 +30,7 @@ class RangeMonitors:
     def __init__(self, spec, response: Response, alarms: dict[str, Alarms]) -> None:
         self.spec, self.response, self.alarms = spec, response, alarms
         self._bank: BiasTracker | None = None if spec.bias_bank is None else BiasTracker(spec.bias_bank)
-        self._past: list[tuple[list[str], np.ndarray, np.ndarray]] = []
+        self._past: list[tuple[list[str], np.ndarray, np.ndarray, np.ndarray]] = []
         self._new_bias: dict[str, float] = {}
         self._next_level_s = 0.0
 
@@ -44,7 +45,8 @@ class RangeMonitors:
         var = self.response.variance(snap.names, snap.own_m2)
         shift = self.response.shifts(snap.names)
         h = np.column_stack([-snap.los, np.ones(len(snap.names)), snap.second])
-        self._remember(snap.names, snap.residual_m + shift, h, var)
+        self._past.append((snap.names, snap.residual_m + shift, h, var))
+        del self._past[:-MEMORY]
         self._raim(snap, h, var, sample, t_s, out)
         self._biases(snap.names, snap.residual_m + shift, h, var, sample, t_s, out)
         self._protect(snap, h, var, sample, t_s, out)
@@ -71,7 +73,7 @@ class RangeMonitors:
 
     def _isolate(self, residual, h, var):
         """(suspects in the order in which they were left out, (chi2 / limit, first suspect) or None, why it ended)."""
-        part, accused, first = list(range(len(residual))), [], None
+        part, accused, first = list(range(len(residual))), list[int](), None
         while True:
             try:
                 w, dof = parity_weight(h[part], var[part])
@@ -103,16 +105,16 @@ class RangeMonitors:
 
     # -- who it is ----------------------------------------------------------------------------------------------------
 
-    def _remember(self, names, raw, h, var) -> None:
-        """Keep W r and the diagonal of W of the satellites that are not left out."""
-        wr, diag = np.zeros(len(names)), np.zeros(len(names))
-        try:
-            wr_all, _ = parity_weight(h, var)
-            wr[:], diag[:] = wr_all @ raw, np.diag(wr_all)
-        except ValueError:
-            pass
-        self._past.append((list(names), wr, diag))
-        del self._past[:-MEMORY]
+    def _scores(self, epochs: int) -> list[tuple[list[str], np.ndarray, np.ndarray]]:
+        """(names, W r, diagonal of W) of the last epochs; zero where the parity says nothing."""
+        out = []
+        for names, raw, h, var in self._past[-epochs:]:
+            try:
+                w, _ = parity_weight(h, var)
+                out.append((names, w @ raw, np.diag(w)))
+            except ValueError:
+                out.append((names, np.zeros(len(names)), np.zeros(len(names))))
+        return out
 
     def rivals(self, name: str) -> list[str]:
         """Satellites whose own fault would explain the last epochs nearly as well as a fault of ``name``.
@@ -121,8 +123,10 @@ class RangeMonitors:
         bias and a ramp since the epoch that suits it best, at every fourth epoch of the memory.
         """
         names = self._past[-1][0]
+        if name not in names:
+            return []
         wr, w = np.zeros((2, len(self._past), len(names)))
-        for k, (then, a, b) in enumerate(self._past):
+        for k, (then, a, b) in enumerate(self._scores(MEMORY)):
             at = [then.index(n) if n in then else -1 for n in names]
             wr[k], w[k] = np.append(a, 0.0)[at], np.append(b, 0.0)[at]
         best = np.zeros(len(names))
@@ -130,8 +134,6 @@ class RangeMonitors:
             for shape in (np.ones(len(wr) - first), np.arange(1.0, len(wr) - first + 1)):
                 size = np.maximum(shape**2 @ w[first:], 1e-12)
                 best = np.maximum(best, (shape @ wr[first:]) ** 2 / size)
-        if name not in names:
-            return []
         close = best > best[names.index(name)] - 2.0 * math.log(ODDS)
         return [n for n, c in zip(names, close) if c and n != name]
 
@@ -154,7 +156,7 @@ class RangeMonitors:
             self.response.shift = self._bank.correction(report)
             self._new_bias = {n: b for n, b in self.response.shift.items() if not before}
 
-    def undo(self, log: NavigatorLog | None) -> np.ndarray | None:
+    def undo(self, log: NavigatorLog | NormalPoints | None) -> np.ndarray | None:
         """What a bias that was just identified has done to the filter's state since its onset, with the sign reversed.
 
         Onset by cumulative sum: the epoch from which the log-likelihood ratio to now, sum of mu (W r)_i - mu^2 W_ii / 2,
@@ -166,7 +168,7 @@ class RangeMonitors:
         if name not in log.names:
             return None
         ratio = []
-        for names, wr, w in reversed(self._past[-min(log.count, log.length) :]):
+        for names, wr, w in reversed(self._scores(min(log.count, log.length))):
             at = names.index(name) if name in names else -1
             ratio.append(mu * wr[at] - 0.5 * mu * mu * w[at] if at >= 0 else 0.0)
         age = 1 + int(np.argmax(np.cumsum(ratio)))

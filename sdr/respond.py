@@ -115,11 +115,11 @@ class Response:
 
     def variance(self, names, own_m2: np.ndarray) -> np.ndarray:
         """Variances in force, from the receiver's own."""
-        return own_m2 * np.array([self.scale.get(n, 1.0) for n in names])
+        return own_m2 * np.array([self.scale.get(n, 1.0) for n in names]) if self.scale else own_m2
 
     def shifts(self, names) -> np.ndarray:
         """Biases taken off the ranges of ``names``, m."""
-        return np.array([self.shift.get(n, 0.0) for n in names])
+        return np.array([self.shift.get(n, 0.0) for n in names]) if self.shift else np.zeros(len(names))
 
     def answer(self, snap: Snapshot | None, t_s: float, dx, p) -> Remedy | None:
         """The remedy of the next epoch; None while nothing may act."""

@@ -1,0 +1,293 @@
+"""Integrity monitors on the filter that steers the channels: normal points of its log, answers, silence when off.
+
+A vector filter (position, velocity, clock) runs at 50 Hz on discriminators of known noise, without samples; the built-in
+scenarios do the same on IF.
+"""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from monitors.normal_points import NormalPoints
+from nav import ultratight as ut
+from nav import ultratight_kernels as kernels
+from nav.eskf import Eskf
+from nav.navlog import Remedy
+from nav.steering import LEFT_OUT, SLOTS, Steering
+from nav.ultratight import Filter, Kinematic, SteeringSpec, start_covariance
+from sdr import scenario
+from sdr.integrity import IntegritySpec
+from sdr.receiver import Receiver
+from sdr.respond import RespondSpec
+
+Z = 5.0
+FS_HZ, T_S, PER_LOOK = 1e6, 0.02, 10
+SIGMA_M, RATE_MPS = 5.0, 0.1
+N = 9
+GRID = {"grid_m": [-20, -15, -10, -5, 0, 5, 10, 15, 20]}
+ALL = {
+    "als": {"window_epochs": 500, "settle_epochs": 100},
+    "bias_bank": GRID,
+    "parallel_filters": {"threshold": 90.0, "r0_m2": 0.0},
+    "bank_every": 5,
+}
+
+
+class Sky:
+    """A vector filter at rest under nine fixed satellites; ``step`` is one epoch as `Steering` does it."""
+
+    heed, weaken = Steering.heed, Steering.weaken
+
+    def __init__(self, sigma_m=SIGMA_M, seed=1):
+        self.rng, self.sigma_m, self.fs_hz, self.epoch = np.random.default_rng(seed), sigma_m, FS_HZ, 0
+        model = Kinematic(accel_psd_m2_s3=0.05, clock_phase_noise_m2_s=1e-3, clock_freq_noise_m2_s3=1e-3)
+        x = np.zeros(kernels.N_X)
+        x[:3] = 4.2e6, 0.8e6, 4.7e6
+        self.filter = f = Filter(
+            SteeringSpec(mode="vector"), model, x, start_covariance(model, x, isb_m=1e-3), SLOTS, 700
+        )
+        az, el = np.radians(40.0 * np.arange(N)), np.radians([70, 20, 35, 50, 15, 30, 60, 25, 40])
+        f.los[:N] = np.column_stack([np.cos(el) * np.sin(az), np.cos(el) * np.cos(az), np.sin(el)])
+        self.truth, self.second = x.copy(), np.zeros(SLOTS)
+        self.active, self.inflate, self.bias = np.arange(SLOTS) < N, np.ones(2 * SLOTS), np.zeros(SLOTS)
+        self.name = [("L1CA", k + 1) if k < N else None for k in range(SLOTS)]
+        self._q, self._f = ut.extended_q(model, x), np.zeros((10 - 1, 10 - 1))
+        self._maps = np.empty((3, f.p.shape[0])), np.empty((3, f.p.shape[0]))
+
+    def step(self, fault_m=None):
+        self.epoch += 1
+        f, log = self.filter, self.filter.slot(self.epoch * T_S)
+        z, var, used, h = log.r, log.var, log.used, log.h
+        ones = np.ones(SLOTS)
+        kernels.predict(
+            3,
+            f.x,
+            f.p,
+            np.zeros((1, 7)),
+            T_S,
+            1.0,
+            np.zeros(3),
+            self._q,
+            self._f,
+            log.phi,
+            log.qd,
+        )
+        h[:] = 0.0
+        kernels.rows(3, f.x, f.p.shape[0], f.los, self.second, ones, ones, *self._maps, h)
+        h[N:SLOTS] = h[SLOTS + N :] = 0.0
+        off = self.truth - f.x
+        z[:], used[:] = 0.0, False
+        used[:N] = used[SLOTS : SLOTS + N] = True
+        z[:N] = -f.los[:N] @ off[:3] + off[6] + self.sigma_m * self.rng.standard_normal(N) - self.bias[:N]
+        z[:N] += 0.0 if fault_m is None else fault_m
+        z[SLOTS : SLOTS + N] = -f.los[:N] @ off[3:6] + off[7] + RATE_MPS * self.rng.standard_normal(N)
+        f.own[:] = np.where(used, np.repeat([SIGMA_M**2, RATE_MPS**2], SLOTS), 0.0)
+        var[:] = np.repeat([SIGMA_M**2, RATE_MPS**2], SLOTS) * self.inflate
+        f.nis, f.n_rows = kernels.filter_update(
+            3, f.x, f.p, h, z, var, used, f.power, 0.0, log.k, log.s, log.p, f.dx
+        )
+
+
+def fly(monitors, respond=None, seconds=30.0, sigma_m=SIGMA_M, fault=None, seed=1):
+    """Position errors and NIS per row at 50 Hz, the monitors, their rows by name, the sky."""
+    sky, run = Sky(sigma_m, seed), None
+    if monitors is not None:
+        run = IntegritySpec(**monitors).start(RespondSpec(**(respond or {})), FS_HZ)
+    place, nis, rows = [], [], {}
+    for k in range(round(seconds / T_S)):
+        if run is not None and not run.response.spec.off:
+            sky.heed(run.remedy, {} if run.steered is None else run.steered.own_m2())
+        sky.step(None if fault is None else fault(k * T_S))
+        place.append(np.linalg.norm((sky.truth - sky.filter.x)[:3]))
+        nis.append(sky.filter.nis / (sky.filter.n_rows - 2 * np.sum(sky.inflate[:N] >= LEFT_OUT)))
+        if run is not None:
+            run.gather(sky)
+            if sky.epoch % PER_LOOK == 0:
+                for name, part in run(round(sky.epoch * T_S * FS_HZ)).items():
+                    rows.setdefault(name, []).append(part)
+    return np.array(place), np.array(nis), run, {k: np.concatenate(v) for k, v in rows.items()}, sky
+
+
+def first(run, monitor):
+    """{satellite: first alarm} of a monitor."""
+    return {f"{k[0].decode()}{k[1]:02d}": v[0]["start_s"] for k, v in run.alarms[monitor].found.items()}
+
+
+def rms(x):
+    return float(np.sqrt(np.mean(np.square(x))))
+
+
+def one(satellite, size):
+    return size * (np.arange(N) == satellite)
+
+
+# ------------------------------------------------------------------------------------------------------ normal points
+
+
+def test_a_normal_point_is_the_mean_of_noise_and_the_error_at_the_windows_start():
+    """Whatever the filter corrected within the window: without dynamics, z' = H eps_0 + mean v exactly, gains divided out."""
+    rng = np.random.default_rng(5)
+    n, slots, clock, drift = 4, 6, 2, 3
+    points = NormalPoints(n, slots, clock, drift)
+    h = rng.standard_normal((2 * slots, n))
+    h[:, clock], h[:, drift] = np.r_[np.ones(6), np.zeros(6)], np.r_[np.zeros(6), np.ones(6)]
+    filt = Eskf(np.eye(n), 2 * slots)
+    eps = rng.standard_normal(n)
+    names = [f"G{k:02d}" for k in range(1, 7)]
+    for window in range(3):
+        start, v = eps.copy(), rng.standard_normal((10, 2 * slots))
+        gain = rng.uniform(0.3, 1.0, (10, 2 * slots))
+        p0 = filt.p.copy()
+        for k in range(10):
+            rows = h * gain[k][:, None]
+            z = rows @ eps + v[k]
+            filt.predict(np.eye(n), 1e-3 * np.eye(n))
+            dx = filt.update(z, rows, np.full(2 * slots, 2.0)).copy()
+            points.add(np.eye(n), 1e-3 * np.eye(n), rows, z, np.full(2 * slots, 2.0), dx)
+            eps = eps - dx
+        assert points.close(window * 1.0, names, np.ones(2 * slots), filt.p) == (window > 0)
+        if window == 0:
+            continue  # the slots got their names just now
+        np.testing.assert_allclose(points.z, h @ start + (v / gain).mean(axis=0), atol=1e-12)
+        np.testing.assert_allclose(points.own, (2.0 / gain**2).mean(axis=0) / 10, rtol=1e-12)
+        last = points.last()
+        np.testing.assert_allclose(last.p, p0 + 1e-2 * np.eye(n), rtol=1e-12)
+        np.testing.assert_allclose(start - eps, points.dx, atol=1e-12)
+
+
+def test_statistics_of_normal_points_are_what_their_thresholds_assume():
+    """Innovations chi-square_1, RAIM chi-square over its quantile; no alarm in 60 s of nine satellites."""
+    from scipy.stats import chi2
+
+    _, _, run, rows, _ = fly(ALL, seconds=60.0)
+    values = rows["innovation"]["value"][10 * N :]
+    assert abs(values.mean() - 1) < Z * np.sqrt(2 / len(values))
+    raim = rows["raim"]["value"] * chi2.isf(1e-6, N - 4)
+    assert abs(raim.mean() - (N - 4)) < Z * np.sqrt(2 * (N - 4) / len(raim))
+    assert not any(first(run, m) for m in ("innovation", "raim", "bias_bank", "parallel_filters", "als"))
+
+
+# ------------------------------------------------------------------------------------------------------ silence
+
+
+def test_listening_changes_no_bit_of_the_steering_filter():
+    fault = lambda t: one(3, 10.0 * (t > 8))  # noqa: E731
+    a, _, _, _, sky_a = fly(None, seconds=16.0, fault=fault)
+    b, _, run, rows, sky_b = fly(ALL, seconds=16.0, fault=fault)
+    np.testing.assert_array_equal(a, b)
+    assert sky_a.filter.x.tobytes() == sky_b.filter.x.tobytes()
+    assert sky_a.filter.p.tobytes() == sky_b.filter.p.tobytes()
+    assert run.remedy is None and "response" not in rows and "G04" in first(run, "bias_bank")
+
+
+# ------------------------------------------------------------------------------------------------------ answers
+
+
+def test_noise_goes_into_the_steering_filter():
+    """Ranges six times as noisy as believed: sigma within 5 / sqrt(2 N), NIS within 20 %, no worse position."""
+    on = {"als": ALL["als"]}
+    a, a_nis, _, _, _ = fly(on, seconds=40.0, sigma_m=30.0)
+    b, b_nis, run, rows, _ = fly(on, {"noise": "als"}, seconds=40.0, sigma_m=30.0)
+    late = slice(1300, None)
+    # Half of the rows are rates, which stay as they are: (36 + 1) / 2.
+    assert a_nis[late].mean() > 15 and 0.8 < b_nis[late].mean() < 1.2
+    assert rms(b[late]) < rms(a[late])
+    last = rows["als"]["estimate_m"][-N:]
+    assert np.all(np.abs(last / 30.0 - 1) < Z / np.sqrt(2 * 500))
+    scale = np.array([run.response.scale[f"G{k + 1:02d}"] for k in range(N)])
+    np.testing.assert_allclose(scale * SIGMA_M**2, last**2, rtol=1e-9)
+
+
+def test_a_bias_is_named_and_removed_and_undone():
+    fault = lambda t: one(3, 10.0 * (t >= 10))  # noqa: E731
+    monitors = {"bias_bank": GRID}
+    clean = fly(monitors, seconds=30.0)[0]
+    off = fly(monitors, seconds=30.0, fault=fault)[0]
+    on, nis, run, _, sky = fly(monitors, {"bias": True}, seconds=30.0, fault=fault)
+    assert list(first(run, "bias_bank")) == ["G04"] and first(run, "bias_bank")["G04"] < 13.0
+    assert sky.bias[3] == 10.0 and np.count_nonzero(sky.bias) == 1
+    late = slice(750, None)
+    assert rms(on[late]) < 0.5 * rms(off[late])
+    # The onset is found to a normal point or two of 0.2 s: what is left of them is far below the bias.
+    assert np.abs(on[late] - clean[late]).max() < 0.3
+    assert abs(nis[late].mean() - 1) < 0.1
+
+
+def test_a_ramp_is_named_excluded_and_undone():
+    fault = lambda t: one(1, 0.6 * max(t - 10.0, 0.0))  # noqa: E731
+    monitors = {"parallel_filters": ALL["parallel_filters"], "bank_every": 5, "raim": None}
+    off = fly(monitors, seconds=60.0, fault=fault)[0]
+    on, nis, run, rows, sky = fly(
+        monitors, {"exclude": ["parallel_filters"], "reset": True}, seconds=60.0, fault=fault
+    )
+    found = first(run, "parallel_filters")
+    assert min(found, key=found.get) == "G02" and set(rows["response"]["prn"]) == {2}
+    assert sky.inflate[1] == LEFT_OUT and np.sum(sky.inflate >= LEFT_OUT) == 2
+    assert rms(on[-500:]) < 0.3 * rms(off[-500:])
+    assert abs(nis[-500:].mean() - 1) < 0.1
+
+
+def test_an_excluded_satellite_is_judged_by_what_it_would_weigh():
+    """Otherwise its statistic vanishes with its weight and it would look well at once."""
+    fault = lambda t: one(1, 20.0 * (t >= 5.0))  # noqa: E731
+    _, _, _, rows, _ = fly({}, {"exclude": ["innovation"]}, seconds=15.0, fault=fault)
+    mine = rows["innovation"][rows["innovation"]["prn"] == 2]
+    assert mine["value"][mine["t_s"] > 8.0].min() > 50.0
+
+
+# ------------------------------------------------------------------------------------------------- who among the alike
+
+
+def test_rivals_are_named_until_the_fault_tells_them_apart():
+    """Two satellites 12 degrees apart: a small bias accuses one and names the other; a large one is alone."""
+    run = IntegritySpec(bias_bank=GRID).start(RespondSpec(), FS_HZ)
+    az, el = np.radians([0, 12, 100, 160, 220, 280, 330]), np.radians([30, 32, 50, 20, 60, 15, 70])
+    los = np.column_stack([np.cos(el) * np.sin(az), np.cos(el) * np.cos(az), np.sin(el)])
+    names, ones = [f"G{k + 1:02d}" for k in range(7)], np.ones(7)
+    got = {}
+    for size in (4.0, 40.0):
+        ranges = run._ranges
+        ranges._past.clear()
+        h = np.column_stack([-los, ones, np.zeros(7)])
+        for k in range(20):
+            raw = np.random.default_rng(k).standard_normal(7)
+            raw[0] += size * (k >= 19)
+            ranges._past.append((names, raw, h, ones))
+        got[size] = ranges.rivals("G01")
+    assert got[40.0] == [] and "G02" in got[4.0]
+
+
+# ------------------------------------------------------------------------------------------------------- on IF samples
+
+
+@pytest.mark.slow
+def test_on_samples_listening_changes_no_bit_and_the_filter_is_watched():
+    """46 s of the built-in scenario: commands, positions and epochs with all monitors on are those without any."""
+    spec = scenario.load("integrity-ut-bias", ["duration_s=46.0", "fault=[]", "jammer=[]"])[0]
+    results = []
+    for update in ({"respond": RespondSpec()}, {"respond": RespondSpec(), "integrity": None}):
+        receiver = Receiver(
+            spec.receiver.model_copy(update=update), scenario.source(spec), scenario.sensors(spec)
+        )
+        results.append((receiver, list(Receiver.__iter__(receiver))))
+    (with_all, a), (_, b) = results
+    assert with_all.integrity.steered is not None
+    for one_, two in zip(a, b, strict=True):
+        for x, y in zip(one_.solutions, two.solutions, strict=True):
+            assert x.tobytes() == y.tobytes()
+        for (_, x, _), (_, y, _) in zip(one_.epochs, two.epochs, strict=True):
+            assert x.tobytes() == y.tobytes()
+    judged = np.concatenate([p["innovation"] for o in a for p in o.integrity if "innovation" in p])
+    assert len(judged) > 100 and judged["value"].mean() < 2.0
+
+
+def test_remedies_of_a_steered_receiver_leave_state_and_covariance_with_the_filter():
+    """The navigator beside it must not take them."""
+    _, _, run, _, sky = fly({"bias_bank": GRID}, {"bias": True}, seconds=1.0)
+    x = sky.filter.x.copy()
+    dx = np.zeros(sky.filter.p.shape[0])
+    dx[0] = 1.0
+    rest = run.steered.hand(Remedy(np.zeros(0), dx, 2.0 * sky.filter.p))
+    assert rest.dx is None and rest.p is None and sky.filter.x[0] - x[0] == 1.0
+    assert SimpleNamespace(n=run.steered.points.count).n == 0
