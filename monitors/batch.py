@@ -98,9 +98,15 @@ def train_monitors(spec, monitors, root, n_trials, n_epochs, settle_epochs=500, 
 
 
 def start_monitors(spec, monitors, dumps=1):
-    """Runs of monitor Specs for the taps and code of a twin, untrained."""
+    """Runs of monitor Specs for the taps, code and front-end filter of a twin, untrained."""
     args = spec.tap_array_chips, spec.integration_s * dumps, spec.signal, spec.prn, spec.waveform
-    return {name: monitor.start(*args) for name, monitor in monitors.items()}
+    return {name: _behind_filter(monitor, spec).start(*args) for name, monitor in monitors.items()}
+
+
+def _behind_filter(monitor, spec):
+    if spec.bandwidth_hz is None or not isinstance(monitor, GlrtMonitor) or monitor.bandwidth_hz is not None:
+        return monitor
+    return monitor.model_copy(update={"bandwidth_hz": spec.bandwidth_hz})
 
 
 def simulate_trial(spec, runs, root, point, trial, n_epochs, settle_epochs=500, dumps=1, smooth_s=100.0):

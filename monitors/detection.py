@@ -51,7 +51,8 @@ def clopper_pearson(k, n, confidence=0.95):
     """Exact two-sided interval of a binomial probability (Clopper & Pearson, Biometrika 26, 1934) -> (low,
     high).
 
-    ``k`` and ``n`` may be effective, hence not whole, numbers; less than one event has no lower limit.
+    ``k`` and ``n`` may be effective, hence not whole, numbers: less than one event has no lower limit, less than one
+    other no upper one.
     """
     from scipy.special import betaincinv
 
@@ -59,7 +60,7 @@ def clopper_pearson(k, n, confidence=0.95):
         raise ValueError(f"{k} events in {n} trials: events must lie between 0 and the number of trials")
     alpha = 0.5 * (1 - confidence)
     low = 0.0 if k < 1 else float(betaincinv(k, n - k + 1, alpha))
-    high = 1.0 if k >= n else float(betaincinv(k + 1, n - k, 1 - alpha))
+    high = 1.0 if k > n - 1 else float(betaincinv(k + 1, n - k, 1 - alpha))
     return low, high
 
 

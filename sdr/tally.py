@@ -172,6 +172,8 @@ def _summary_row(
     for other in _COUNTED.values():
         row[f"{other}_k"] = int(rows[f"{other}_missed"].sum())
         row[f"{other}_n"] = int(rows[f"{other}_n"].sum())
+        other_rate = point_rate(rows[f"{other}_missed"], rows[f"{other}_n"], spec.seeds.evaluation)
+        row[f"{other}_ci"] = [other_rate.low, other_rate.high]
     row["curve_k"] = rows["curve_missed"].sum(axis=0).tolist()
     row["curve_n"] = rows["curve_n"].sum(axis=0).tolist()
     row |= _roc(rows, limit, c.jammed) | _first_alarm(rows, c.jammed)

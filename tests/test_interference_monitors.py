@@ -6,6 +6,7 @@ import pytest
 from scipy import stats
 
 from monitors.baselines import AdcHistogram, AgcGain, Cn0Drop, NoiseFloor, SignalQuality
+from monitors.batch import start_monitors
 from monitors.fft import FftMonitor
 from monitors.glrt import GlrtMonitor
 from monitors.multichannel_ar import MultichannelAr, fit
@@ -14,7 +15,7 @@ from monitors.records import alarms
 from signals.constants import CHIP_RATE_HZ
 from signals.modulation import autocorrelation
 from signals.multipath import Aeronautical, Echoes
-from tracking.correlator_model import Twin, TwinCW, code_spectrum, noise_sigma
+from tracking.correlator_model import Twin, TwinCW, code_spectrum, cw_taps, noise_sigma
 
 Z = 5.0
 GPS = {"signal": "L1CA", "prn": 6, "cn0_dbhz": 40.5, "integration_s": 0.02, "early_late_space_chips": 1.0}
@@ -171,6 +172,38 @@ def test_glrt_windows_are_sums_and_do_not_depend_on_calls():
     # Gamma(50) null
     assert window.threshold(1e-3, 80.0) == pytest.approx(stats.gamma.isf(1e-3 / 80, 50))
     assert single.threshold(1.6e-5, 84.0) == pytest.approx(math.log(84 / 1.6e-5))
+
+
+@pytest.mark.parametrize("bandwidth_hz", [1.6e6, 2.0e6])
+def test_glrt_behind_a_front_end_filter(bandwidth_hz):
+    """The filter colours the noise of the taps and rounds the peak; told of it, the GLRT keeps its null."""
+    spec = Twin(**GPS, bandwidth_hz=bandwidth_hz)
+    run = start_monitors(spec, {"g": GlrtMonitor()})["g"]
+    assert run.spec.bandwidth_hz == bandwidth_hz and run.frequency_hz.max() <= 0.5 * bandwidth_hz
+    R = spec.autocorrelation(TAPS[:, None] - TAPS[None, :])
+    white = run.whitener @ R @ run.whitener.T
+    assert np.allclose(white, np.eye(len(white)), atol=1e-6)
+    assert np.max(np.abs(run.operator @ spec.autocorrelation(TAPS))) < 1e-6
+    z = spec.start_open(3)(30_000)
+    run.train(z)
+    passed = spec.autocorrelation(0.0)
+    n = run.rank * len(z)
+    assert run.noise_variance == pytest.approx(S2, rel=Z / math.sqrt(n))
+    assert passed < 0.98
+    p_fa = 3e-3
+    threshold = run.threshold(p_fa, run.effective_bins(60_000, tail=p_fa))
+    counted = np.mean(run.fresh()(z)["value"] >= threshold)
+    assert counted == pytest.approx(p_fa, abs=Z * math.sqrt(p_fa / 30_000 + p_fa / 60_000))
+    # A tone of the band is seen with its own gain: noncentral chi-square in its bin.
+    f = float(run.frequency_hz[np.argmax(run.gain)])
+    tone = Twin(**GPS, bandwidth_hz=bandwidth_hz, jammers=(TwinCW(js_db=20.0, freq_hz=f, line="worst"),))
+    amplitude = abs(cw_taps(tone, tone.jammers[0])[17])
+    value = run.fresh()(tone.start_open(4)(2000))["value"]
+    expected = 0.5 * (amplitude * run.line_gain(f)) ** 2 / S2 + 1
+    assert value.mean() == pytest.approx(expected, rel=0.05, abs=2.0)
+    # Not told, it projects another peak out and the signal leaks.
+    naive = GlrtMonitor(noise_variance=S2).start(TAPS, 0.02, "L1CA", 6)
+    assert np.linalg.norm(naive.operator @ spec.autocorrelation(TAPS)) > 0.01
 
 
 def test_importance_sampling_against_formula_and_counting():

@@ -4,6 +4,7 @@ import json
 
 import pytest
 
+from monitors.detection import clopper_pearson
 from sdr.reproduce import COLUMNS, VERDICTS, ouzeau, reproduce
 
 
@@ -20,7 +21,11 @@ def test_lines_as_published(tmp_path):
 
 def test_four_definitions_say_nothing_where_there_are_too_few_tests():
     point = {"monitor": "fft-iq", "curve_k": [0] * 20, "curve_n": [100] * 20}
-    point |= {f"{n}_{x}": v for n in ("on", "hit", "event", "hazard") for x, v in (("k", 0), ("n", 6))}
+    point |= {
+        f"{n}_{x}": v
+        for n in ("on", "hit", "event", "hazard")
+        for x, v in (("k", 0), ("n", 6), ("ci", clopper_pearson(0, 6)))
+    }
     rows = ouzeau._four_definitions(point, "40.5")
     assert len(rows) == 5
     assert {r["verdict"] for r in rows} == {"not stated"}
@@ -50,6 +55,12 @@ def test_quick_run_and_its_acceptance_ranges(tmp_path):
     assert 0.925 < whole["ours"] < 0.955
     assert one("glrt,", "C/N0 40.5", "0.443")["ours"] == 0
     assert one("GPS PRN 6", "undetected smoothed")["ours"] < 0.6
+    # Issue 5: at least 5 dB less jammer than the paper's monitor, at a P_FA that counts confirm.
+    gain = one("dB that glrt needs less")
+    assert gain["ci_low"] > 5.0
+    for name in ("fft-iq", "glrt"):
+        counted = one("P_FA counted, " + name)
+        assert counted["ci_low"] < 1.6e-5 * 1.5 and counted["ci_high"] > 1.6e-5 / 1.5
     galileo = one("Galileo fft-iq")
     assert galileo["ci_low"] < 0.4 and galileo["ci_high"] > 0.3
     assert one("Galileo glrt")["ours"] == 0

@@ -48,6 +48,7 @@ __all__ = [
     "code_spectrum",
     "cw_taps",
     "default_taps_chips",
+    "filtered_autocorrelation",
     "jammer_hz",
     "noise_sigma",
     "worst_line",
@@ -223,12 +224,9 @@ class Twin(_Spec):
         """R(d) after the front-end filter: correlation of the signal, and covariance of the noise, over the
         taps.
         """
-        if self.bandwidth_hz is None:
-            return autocorrelation(self.signal, self.prn, delay_chips, self.waveform)
-        table, per_chip = _acf_table(self.signal, self.prn, self.waveform, self.bandwidth_hz)
-        y = np.mod(np.asarray(delay_chips, float) * per_chip, len(table))
-        i = np.floor(y).astype(np.int64)
-        return table[i % len(table)] + (y - i) * (table[(i + 1) % len(table)] - table[i % len(table)])
+        return filtered_autocorrelation(
+            self.signal, self.prn, delay_chips, self.waveform, self.bandwidth_hz
+        )
 
     @property
     def tap_array_chips(self):
@@ -312,16 +310,21 @@ def _acf_table(signal, prn, waveform, bandwidth_hz=None):
     return table, per_chip
 
 
+def filtered_autocorrelation(signal, prn, delay_chips, waveform=None, bandwidth_hz=None):
+    """R(d) of a code behind a brick-wall filter of ``bandwidth_hz`` about the carrier (None: no filter), float64."""
+    if bandwidth_hz is None:
+        return autocorrelation(signal, prn, delay_chips, waveform)
+    table, per_chip = _acf_table(signal, prn, waveform, bandwidth_hz)
+    y = np.mod(np.asarray(delay_chips, float) * per_chip, len(table))
+    i = np.floor(y).astype(np.int64)
+    return table[i % len(table)] + (y - i) * (table[(i + 1) % len(table)] - table[i % len(table)])
+
+
 @lru_cache(maxsize=64)
 def _noise_factor(signal, prn, waveform, bandwidth_hz, taps):
     """F with F F^T = R(d_i - d_j), float64 (K, K): Cholesky, or the symmetric root where R is singular."""
     d = np.array(taps)
-    # Only what R depends on enters, so that twins of other settings share the factor.
-    settings: dict[str, Any] = {
-        "signal": signal, "prn": prn, "waveform": waveform, "bandwidth_hz": bandwidth_hz,
-    }  # fmt: skip
-    spec = Twin.model_construct(**settings)
-    R = spec.autocorrelation(d[:, None] - d[None, :])
+    R = filtered_autocorrelation(signal, prn, d[:, None] - d[None, :], waveform, bandwidth_hz)
     R = 0.5 * (R + R.T)
     try:
         return np.linalg.cholesky(R)
