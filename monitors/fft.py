@@ -11,9 +11,15 @@ from pydantic import BaseModel, ConfigDict, Field
 from monitors.records import checked_corr, statistics
 from signals.constants import CHIP_RATE_HZ
 
-__all__ = ["FftMonitor", "FftRun", "to_columns"]
+__all__ = ["FftMonitor", "FftRun", "block_width", "to_columns"]
 
 _BLOCK = 1024
+_GRAIN = 64
+
+
+def block_width(n, most):
+    """Columns in which n epochs are worked on: few epochs do not pay for a whole block."""
+    return min(most, max(1, -(-n // _GRAIN)) * _GRAIN)
 
 
 @njit(cache=True, nogil=True)
@@ -167,11 +173,12 @@ class FftRun:
         """Maximum |DFT| of each epoch and its frequency, float64 (n,) each; ``corr`` complex64 (n, K)."""
         corr = checked_corr(corr, self.n_taps)
         value, hz = np.empty(len(corr)), np.empty(len(corr))
-        for lo in range(0, len(corr), _BLOCK):
-            if len(self._best) != _BLOCK:
-                self._buffers(_BLOCK)
+        width = block_width(len(corr), _BLOCK)
+        for lo in range(0, len(corr), width):
+            if len(self._best) != width:
+                self._buffers(width)
             to_columns(corr, lo, self._z)
-            m = min(_BLOCK, len(corr) - lo)
+            m = min(width, len(corr) - lo)
             value[lo : lo + m] = self.block(self._z)[:m]
             hz[lo : lo + m] = self.peak_hz[:m]
         return value, hz

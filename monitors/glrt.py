@@ -15,10 +15,10 @@ import numpy as np
 from numba import njit
 from pydantic import BaseModel, ConfigDict, Field
 
-from monitors.fft import to_columns
+from monitors.fft import block_width, to_columns
 from monitors.records import checked_corr, statistics
 from signals.constants import CHIP_RATE_HZ
-from signals.modulation import autocorrelation
+from tracking.correlator_model import filtered_autocorrelation
 
 __all__ = ["GlrtMonitor", "GlrtRun"]
 
@@ -110,6 +110,9 @@ class GlrtMonitor(BaseModel):
     accumulate_epochs: int = Field(1, ge=1, le=100_000)
     """Epochs summed without phase, M."""
     noise_variance: float | None = Field(None, gt=0)  # per component; None: from training
+    bandwidth_hz: float | None = Field(None, ge=2e5, le=60e6)
+    """Front-end filter, brick wall, both sides of L1: it colours the noise of the taps, rounds the peak and lets no
+    line beyond its edge pass. None: no filter (in a campaign that of the twin)."""
 
     def start(self, taps_chips, integration_s, signal="L1CA", prn=1, waveform=None):
         """-> GlrtRun."""
@@ -126,12 +129,18 @@ class GlrtRun:
             guard = _GUARD_CHIPS["L1CA" if signal == "L1CA" else "E1B"]
         if len(guard) >= len(taps_chips):
             raise ValueError(f"{len(guard)} guard delays leave nothing of {len(taps_chips)} taps: use fewer")
-        R = autocorrelation(signal, prn, taps_chips[:, None] - taps_chips[None, :], waveform)
-        self.whitener = _inverse_root(R)
-        H = autocorrelation(signal, prn, taps_chips[:, None] + np.array(guard)[None, :], waveform)
-        basis = np.linalg.svd(self.whitener @ H, full_matrices=False)[0]
-        self.projector = np.eye(len(taps_chips)) - basis @ basis.T
-        self.rank = len(taps_chips) - len(guard)
+        code = signal, prn
+        filtered = waveform, spec.bandwidth_hz
+        R = filtered_autocorrelation(*code, taps_chips[:, None] - taps_chips[None, :], *filtered)
+        self.whitener, self._root = _whitener(R, spec.bandwidth_hz is not None)
+        H = filtered_autocorrelation(*code, taps_chips[:, None] + np.array(guard)[None, :], *filtered)
+        basis, size, _ = np.linalg.svd(self.whitener @ H, full_matrices=False)
+        basis = basis[:, size > 1e-6 * size[0]]
+        dimensions = len(self.whitener)
+        self.projector = np.eye(dimensions) - basis @ basis.T
+        self.rank = dimensions - basis.shape[1]
+        if self.rank < 1:
+            raise ValueError("the guard delays leave nothing of these taps behind this filter: use fewer")
         self._set_grid()
         self.noise_variance = spec.noise_variance
         self.chip_rate_hz = CHIP_RATE_HZ
@@ -153,7 +162,8 @@ class GlrtRun:
 
     def _set_grid(self):
         spec = self.spec
-        f = spec.grid_hz * np.arange(math.floor(spec.max_hz / spec.grid_hz * (1 + 1e-12)) + 1)
+        edge = min(spec.max_hz, 0.5 * (spec.bandwidth_hz or math.inf))
+        f = spec.grid_hz * np.arange(math.floor(edge / spec.grid_hz * (1 + 1e-12)) + 1)
         PW = self.projector @ self.whitener
         a = PW @ np.exp(-2j * np.pi * np.outer(self.taps_chips, f) / CHIP_RATE_HZ)
         gain = np.linalg.norm(a, axis=0)
@@ -224,11 +234,10 @@ class GlrtRun:
         The maximum over a smooth random field is, far out, that of N_eff independent bins.
         """
         rng = np.random.Generator(np.random.Philox(seed))
-        # Noise with covariance R: the root of R is the whitener's inverse.
-        root = np.linalg.inv(self.whitener)
+        root = self._root  # noise with covariance R
         parts = []
         for _ in range(max(1, n_draws // _BLOCK)):
-            g = rng.standard_normal((len(self.taps_chips), 2 * _BLOCK), np.float32)
+            g = rng.standard_normal((root.shape[1], 2 * _BLOCK), np.float32)
             power = self.powers((root @ g).astype(np.float32))
             parts.append(0.5 * power.max(axis=0))
         values = np.concatenate(parts)
@@ -266,10 +275,12 @@ class GlrtRun:
         corr = checked_corr(corr, len(self.taps_chips))
         M = self.spec.accumulate_epochs
         values, bins, ends = [], [], []
-        for lo in range(0, len(corr), _BLOCK):
-            m = min(_BLOCK, len(corr) - lo)
-            to_columns(corr, lo, self._z)
-            value, where, last = self._epochs(m) if M == 1 else self._windows(m)
+        width = block_width(len(corr), _BLOCK)
+        z = self._z if width == _BLOCK else np.empty((len(self.taps_chips), 2 * width), np.float32)
+        for lo in range(0, len(corr), width):
+            m = min(width, len(corr) - lo)
+            to_columns(corr, lo, z)
+            value, where, last = self._epochs(z, m) if M == 1 else self._windows(z, m)
             values.append(value)
             bins.append(where)
             ends.append(lo + last)
@@ -281,26 +292,35 @@ class GlrtRun:
         self.epoch += len(corr)
         return result
 
-    def _epochs(self, m):
-        value, where = self.block(self._z)
+    def _epochs(self, z, m):
+        value, where = self.block(z)
         return value[:m], where[:m], np.arange(m)
 
-    def _windows(self, m):
+    def _windows(self, z, m):
         """Windows that end among the next m epochs: statistic, row, last epoch."""
         M = self.spec.accumulate_epochs
         out, where = np.empty(m), np.empty(m, np.int64)
         first = M - self._filled - 1
-        power = self.powers(self._z)
+        power = self.powers(z)
         done, self._filled = _windows(power, m, M, self._sum, self._filled, out, where)
         return out[:done] * (0.5 / self._variance()), where[:done], first + M * np.arange(done)
 
 
-def _inverse_root(R):
-    """W with W R W^T = I: inverse Cholesky factor; refuses taps that carry no independent noise."""
+def _whitener(R, filtered):
+    """W (r, K) with W R W^T = I, and a root G (K, r) of R; refuses taps that carry no independent noise.
+
+    Behind a filter taps closer than its resolution share their noise: W keeps the r directions that have any.
+    """
+    R = 0.5 * (R + R.T)
+    if filtered:
+        value, vector = np.linalg.eigh(R)
+        keep = value > 1e-4 * value[-1]
+        root = np.sqrt(value[keep])
+        return vector[:, keep].T / root[:, None], vector[:, keep] * root
     try:
-        root = np.linalg.cholesky(0.5 * (R + R.T))
+        root = np.linalg.cholesky(R)
     except np.linalg.LinAlgError:
         raise ValueError(
             "the noise of these taps is linearly dependent: use a wider tap spacing for the GLRT"
         ) from None
-    return np.linalg.inv(root)
+    return np.linalg.inv(root), root

@@ -233,7 +233,8 @@ class MultichannelArRun:
         e = x[p:] @ self._matrices[0]
         for i in range(1, p + 1):
             e += x[p - i : len(x) - i] @ self._matrices[i]
-        return np.einsum("nk,nk->n", e.real, e.real) + np.einsum("nk,nk->n", e.imag, e.imag)
+        parts = e.view(np.float32)
+        return np.einsum("nk,nk->n", parts, parts)
 
     def __call__(self, corr, sample_index=None):
         """STATISTIC, one per hop once a window is full; ``corr`` complex64 (n, K)."""

@@ -389,23 +389,25 @@ class Receiver:
         """Let the redundant-measurement estimator hear the channels' discriminators."""
         if self.integrity is None or self.integrity.spec.noise_rmd is None:
             return
-        channels = self.tracker.channels
-        for c, epochs, _ in rows:
-            signal, prn = channels["signal"][c].decode(), int(channels["prn"][c])
-            gps = signal == "L1CA"
-            loops = self.spec.tracking.l1ca if gps else self.spec.tracking.e1
-            self.integrity.hear(f"{'G' if gps else 'E'}{prn:02d}", epochs, loops)
+        heard = {c: epochs for c, epochs, _ in rows}
+        for (signal, prn), c in self.channel_of.items():
+            if c in heard:
+                gps = signal == "L1CA"
+                loops = self.spec.tracking.l1ca if gps else self.spec.tracking.e1
+                self.integrity.hear(f"{'G' if gps else 'E'}{prn:02d}", heard[c], loops)
 
     def _watch(self, out: Outcome) -> None:
         """Let every monitor see the windows of taps; what comes back are flags, for the next epoch."""
         out.statistics += self.front.take()
         watches = [m for m in self.monitors if isinstance(m, Watch)]
-        channels = self.tracker.channels
+        channels, heard = self.tracker.channels, []
         for c, epochs, corr in out.epochs if watches else ():
             signal, prn, k = channels["signal"][c].decode(), int(channels["prn"][c]), self.tracker.window(c)
             taps = self._nominal_taps(signal), self.tracker.taps_chips(c)[:k]
-            for monitor in watches:
-                rows = monitor(signal, prn, epochs, corr[:, :k], taps, self.waveform(signal))
+            heard.append((signal, prn, epochs, corr[:, :k], taps, self.waveform(signal)))
+        for monitor in watches:
+            for channel in heard:
+                rows = monitor(*channel)
                 if len(rows):
                     self.flags.note(monitor, rows)
                     out.statistics.append((monitor.spec.name, rows))

@@ -20,7 +20,7 @@ from monitors.multichannel_ar import MultichannelAr
 from nav.navlog import REMEDY, Remedy
 from sdr.watch_front import FrontWatch
 from sdr.watch_null import null_of, one_blas_thread
-from sdr.watch_post import MONITOR, Post
+from sdr.watch_post import MONITOR, Post, joined
 from signals.multipath import MultipathSpec
 from tracking.channel import STATE_LOCKED
 
@@ -165,7 +165,8 @@ class _Channel:
         self.prompt = int(np.argmin(np.abs(self.taps)))
         self._cn0: list[float] = []
         self._heard: list[tuple[np.ndarray, np.ndarray]] = []
-        self._heard_s = 0.0
+        self._heard_n = 0  # samples that wait, about
+        self._due = (spec.batch_s - 0.5 * self.epoch_s) * fs_hz
         self._settled: float = math.nan  # sample from which it counts
         self._next = -1
         self._lost: int | None = None  # end of the last stretch
@@ -187,9 +188,9 @@ class _Channel:
 
     def advance(self, epochs: np.ndarray, corr: np.ndarray) -> np.ndarray:
         """Take in integrations; every ``batch_s`` they are worked on, for a call costs more than an epoch."""
-        self._heard.append((epochs.copy(), corr.copy()))
-        self._heard_s += float(epochs["n_samples"].sum()) / self.fs_hz
-        return self._work() if self._heard_s >= self.spec.batch_s else np.empty(0, MONITOR)
+        self._heard.append((epochs, corr))
+        self._heard_n += len(epochs) * int(epochs["n_samples"][0])
+        return self._work() if self._heard_n >= self._due else np.empty(0, MONITOR)
 
     def finish(self, sample: int) -> np.ndarray:
         """MONITOR rows of what waits; a channel that is not locked at the end has been so since it was lost."""
@@ -198,33 +199,43 @@ class _Channel:
             self._lose()
         if self._lost is not None:
             self.post.rest(self._lost / self.fs_hz, sample / self.fs_hz)
-        return np.concatenate(rows)
+        return joined(rows)
 
     def _work(self) -> np.ndarray:
         if not self._heard:
             return np.empty(0, MONITOR)
-        epochs, corr = (np.concatenate(part) for part in zip(*self._heard))
-        self._heard, self._heard_s = [], 0.0
-        out = [np.empty(0, MONITOR)]
+        # Column by column: numpy takes long over joining rows.
+        index, n, state, cn0 = (
+            np.concatenate([e[name] for e, _ in self._heard])
+            for name in ("sample_index", "n_samples", "state", "cn0_dbhz")
+        )
+        corr = np.concatenate([c for _, c in self._heard])
+        self._heard, self._heard_n = [], 0
+        index = index.astype(np.int64)
+        ends = index + n
+        cut = np.flatnonzero((index[1:] != ends[:-1]) | (state[1:] != state[:-1])) + 1
+        out: list[np.ndarray] = []
         with one_blas_thread():
-            for part in _stretches(epochs):
-                out += self._stretch(epochs[part], corr[part])
-        return np.concatenate(out)
+            for a, b in pairwise([0, *cut.tolist(), len(index)]):
+                part = slice(a, b)
+                out += self._stretch(state[a] == STATE_LOCKED, index[part], ends[part], cn0[part], corr[part])
+        return joined(out)
 
-    def _stretch(self, e: np.ndarray, corr: np.ndarray) -> list[np.ndarray]:
+    def _stretch(
+        self, locked: bool, index: np.ndarray, ends: np.ndarray, cn0: np.ndarray, corr: np.ndarray
+    ) -> list[np.ndarray]:
         """MONITOR rows of consecutive integrations in one state."""
-        out, first = [], int(e["sample_index"][0])
-        if first != self._next:
+        out, first = [], int(index[0])
+        if first != self._next or not locked:
             out.append(self._lose())
-        if e["state"][0] != STATE_LOCKED:
-            out.append(self._lose())
+        if not locked:
             return out
-        self._next = int(e["sample_index"][-1]) + int(e["n_samples"][-1])
+        self._next = int(ends[-1])
         self._resume(first)
-        settled = e["sample_index"] >= self._settled
+        settled = int(np.searchsorted(index, self._settled))
         if self.threshold is None:
-            self._cn0 += e["cn0_dbhz"][settled].tolist()
-        self._take(e[settled], corr[settled])
+            self._cn0 += cn0[settled:].tolist()
+        self._take(ends[settled:], ends[-1] - index[-1], corr[settled:])
         # Always the same batches, however the samples were cut into slabs.
         n = max(1, round(self.spec.batch_s / self.epoch_s))
         while sum(map(len, self._waiting)) >= n:
@@ -255,12 +266,9 @@ class _Channel:
         self._waiting: list[np.ndarray] = []
         self._ends: list[np.ndarray] = []
 
-    def _take(self, epochs: np.ndarray, corr: np.ndarray) -> None:
+    def _take(self, ends: np.ndarray, n_samples: int, corr: np.ndarray) -> None:
         """Sum integrations to monitor epochs, their signs wiped by the prompt's."""
-        if not len(epochs):
-            return
-        ends = epochs["sample_index"].astype(np.int64) + epochs["n_samples"]
-        dumps = max(1, round(self.epoch_s * self.fs_hz / float(epochs["n_samples"][0])))
+        dumps = max(1, round(self.epoch_s * self.fs_hz / float(n_samples)))
         if dumps > 1:
             corr = corr * np.where(corr[:, self.prompt].real < 0, -1, 1).astype(np.float32)[:, None]
             corr, ends = np.concatenate([self._dumps, corr]), np.concatenate([self._dump_ends, ends])
@@ -280,13 +288,3 @@ class _Channel:
         n = len(corr) if n is None else n
         self._waiting, self._ends = ([corr[n:]], [ends[n:]]) if n < len(corr) else ([], [])
         return self.post.take(corr[:n], ends[:n]) if len(corr) else np.empty(0, MONITOR)
-
-
-def _stretches(epochs: np.ndarray) -> list[slice]:
-    """Slices of consecutive integrations in one state."""
-    follows = epochs["sample_index"][1:] == epochs["sample_index"][:-1] + epochs["n_samples"][:-1].astype(
-        np.uint64
-    )
-    cut = np.flatnonzero(~follows | (np.diff(epochs["state"].astype(int)) != 0)) + 1
-    edges = [0, *cut.tolist(), len(epochs)]
-    return [slice(a, b) for a, b in pairwise(edges)]

@@ -12,7 +12,7 @@ import numpy as np
 
 from monitors.baselines import AdcHistogram, count_levels
 from monitors.short_training import FisherNull, WanderNull
-from sdr.watch_post import MONITOR, Post
+from sdr.watch_post import Post, joined
 
 RMS_LEVELS = 20.0
 """Samples of more than 8 bits are counted on a grid that puts the rms of their beginning here."""
@@ -36,14 +36,14 @@ class FrontWatch:
 
     def hear(self, n0: int, iq: np.ndarray, source: Any) -> np.ndarray:
         """MONITOR rows of the windows that the samples n0 .. complete."""
-        rows = [np.empty(0, MONITOR)]
+        rows: list[np.ndarray] = []
         while (first := self._first()) < n0 + iq.shape[1]:
             value = self._histogram(first - n0, iq, source) if self._adc else self._gain(first, source)
             if value is None:
                 break
             rows.append(self.post.take(np.array([value]), np.array([first + self._length])))
             self._window += 1
-        return np.concatenate(rows)
+        return joined(rows)
 
     def report(self, quiet_until_s: float) -> list[dict[str, Any]]:
         """Its row for JSON."""

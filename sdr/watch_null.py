@@ -7,7 +7,9 @@ the errors of a short training included, is the null. Its seeds are no scenario'
 theory gives to the few windows of their training: Student's t, Fisher's F.
 """
 
+import contextlib
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -129,13 +131,25 @@ def _rehearse(
 
 
 @lru_cache(maxsize=1)
-def _blas() -> Any:
+def _blas() -> list[Any]:
     import scipy.linalg  # noqa: F401  (brings a BLAS of its own, which must be loaded to be limited)
     from threadpoolctl import ThreadpoolController
 
-    return ThreadpoolController()
+    return ThreadpoolController().select(user_api="blas").lib_controllers
 
 
-def one_blas_thread() -> Any:
-    """Context in which one BLAS thread works: on small matrices several are slower, and change the last bit."""
-    return _blas().limit(limits=1, user_api="blas")
+@contextlib.contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Context in which one BLAS thread works: on small matrices several are slower, and change the last bit.
+
+    What ``threadpoolctl.limit`` does, without its account of every library, which takes longer than a batch.
+    """
+    before = [(lib, lib.get_num_threads()) for lib in _blas()]
+    changed = [(lib, n) for lib, n in before if n != 1]
+    for lib, _ in changed:
+        lib.set_num_threads(1)
+    try:
+        yield
+    finally:
+        for lib, n in changed:
+            lib.set_num_threads(n)

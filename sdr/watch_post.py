@@ -54,7 +54,7 @@ class Post:
         self.signal, self.prn = signal, prn
         self._null = null
         self.threshold: float | None = None
-        self.approach_threshold = math.nan
+        self.approach_threshold: float | None = None
         self.rule = self.unavailable = ""
         self.trained_s = math.nan
         self.quiet_s = 0.0
@@ -98,16 +98,16 @@ class Post:
 
     def _train(self, x: np.ndarray) -> None:
         self._quiet = []
+        given = self.spec.threshold
         try:
             self.run.train(x)
-            null = self._null(x)
+            null = self._null(x) if given is None else None
         except ValueError as err:
             self.unavailable = str(err)
             return
-        given = self.spec.threshold
-        self.threshold = null.isf(self.p_fa) if given is None else given
-        self.rule = null.rule if given is None else "given"
-        self.approach_threshold = null.isf(self._per_approach)
+        self.rule = "given" if null is None else null.rule
+        self.threshold = given if null is None else null.isf(self.p_fa)
+        self.approach_threshold = given if null is None else null.isf(self._per_approach)
         self.run = self.run.fresh()
 
     def rest(self, start_s: float, end_s: float) -> None:
@@ -216,6 +216,12 @@ class Post:
             f"not trained: it needs {wait}{self.spec.training_s:g} s of {where} and had {self.quiet_s:.3g} s; "
             "lengthen the recording or shorten training_s"
         )
+
+
+def joined(rows: list[np.ndarray]) -> np.ndarray:
+    """MONITOR rows in one array; numpy takes its time over joining structured ones, and mostly there is one."""
+    rows = [r for r in rows if len(r)]
+    return rows[0] if len(rows) == 1 else np.concatenate([np.empty(0, MONITOR), *rows])
 
 
 def poisson_interval(expected: float) -> list[int]:
