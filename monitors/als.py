@@ -92,7 +92,9 @@ def _accumulate(
     parts[0] = p_start
     flat = parts.reshape((2 + q) * n, n)
     turned = np.empty_like(parts)
-    c = np.zeros((lags, 2 + q, n, p))  # propagated C of the last epochs, by age
+    # Transposed, so that all parts are one product: H P of this epoch, and the propagated C of the last ones, by age.
+    hp = np.empty((2 + q, p, n))
+    ct = np.zeros((lags, 2 + q, p, n))
     used_then = np.zeros((lags, p))
     for e in range(e_count):
         he = np.empty((p, n))
@@ -104,8 +106,9 @@ def _accumulate(
         # Lags j >= 1 of older epochs, then lag 0 of this one.
         for j in range(1, min(lags, e - settle + 1)):
             old = (e - j) % lags
+            blocks = np.dot(ct[old].reshape((2 + q) * p, n), ht).reshape(2 + q, p, p)
             for i in range(2 + q):
-                block = np.dot(he, c[old, i])
+                block = blocks[i].T
                 for a in range(p):
                     for b in range(p):
                         w = we[a] * used_then[old, b]
@@ -117,9 +120,15 @@ def _accumulate(
                 for b in range(p):
                     counts[j, a, b] += we[a] * used_then[old, b]
         pht = np.dot(flat, ht).reshape(2 + q, n, p)
+        for i in range(2 + q):
+            for x in range(n):
+                for a in range(p):
+                    hp[i, a, x] = pht[i, x, a]
+        stacked = hp.reshape((2 + q) * p, n)
         if e >= settle:
+            blocks = np.dot(stacked, ht).reshape(2 + q, p, p)
             for i in range(2 + q):
-                block = np.dot(he, pht[i])
+                block = blocks[i]
                 if i >= 2:
                     a, b = pairs[i - 2, 0], pairs[i - 2, 1]
                     block[a, b] += 1.0
@@ -145,16 +154,14 @@ def _accumulate(
             l_rows[:, a] = gain[:, rows[a]]
         for j in range(1, min(lags - 1, e - settle + 1)):
             old = (e - j) % lags
-            for i in range(2 + q):
-                c[old, i] = np.dot(abar, c[old, i])
+            ct[old] = np.dot(ct[old].reshape((2 + q) * p, n), at).reshape(2 + q, p, n)
         now = e % lags
-        for i in range(2 + q):
-            c[now, i] = np.dot(abar, pht[i])
-            if i >= 2:
-                a, b = pairs[i - 2, 0], pairs[i - 2, 1]
-                c[now, i, :, b] -= l_rows[:, a]
-                if a != b:
-                    c[now, i, :, a] -= l_rows[:, b]
+        ct[now] = np.dot(stacked, at).reshape(2 + q, p, n)
+        for i in range(q):
+            a, b = pairs[i, 0], pairs[i, 1]
+            ct[now, 2 + i, b] -= l_rows[:, a]
+            if a != b:
+                ct[now, 2 + i, a] -= l_rows[:, b]
         used_then[now] = we
         # P' = Abar (P Abar')  as two stacked products, P symmetric.
         right = np.dot(flat, at).reshape(2 + q, n, n)
@@ -375,6 +382,8 @@ class Als(BaseModel):
     """Navigation epochs in one estimate."""
     settle_epochs: int = Field(100, ge=0, le=100_000)
     """Epochs left out after the start and after each retuning."""
+    pause_epochs: int = Field(0, ge=0, le=1_000_000)
+    """Epochs without an estimate after each, to save time."""
     full: bool = False
     """Estimate a full R instead of a diagonal one."""
     joint_q: bool = False
@@ -424,7 +433,7 @@ class AlsRun:
         self._seen += epochs
         if self._seen < need:
             return None
-        self._seen = 0
+        self._seen = -spec.pause_epochs
         try:
             log = take(need)
             self.result = estimate(

@@ -8,7 +8,7 @@ for 4 ms codes): each half has 2 R, so R = E[d^2] / 4, as long as the squaring l
 
 import math
 from functools import lru_cache
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numba import njit
@@ -129,41 +129,56 @@ class NoiseRmdRun:
         return out
 
 
+@njit(cache=True, nogil=True)
+def follow(epochs, ring, state):
+    """Differences of successive code discriminators of one channel, in chips, into ``ring`` (N,).
+
+    ``state`` (3,): differences so far, sample after the last integration in lock (-1: none), its discriminator.
+    """
+    for e in epochs:
+        if e.state != STATE_LOCKED:
+            state[1] = -1.0
+            continue
+        if state[1] == e.sample_index:
+            ring[np.int64(state[0]) % ring.size] = e.code_error_chips - state[2]
+            state[0] += 1.0
+        state[1], state[2] = e.sample_index + e.n_samples, e.code_error_chips
+
+
 class DiscriminatorNoise:
     """Range variance of channels from differences of their successive code discriminators, without a second channel.
 
-    ``hear`` every channel's new integrations; ``variance_m2`` then holds those whose window of differences is full.
+    ``hear`` every channel's new integrations; ``estimate`` gives the variances of those whose window is full.
     """
 
     def __init__(self, spec: NoiseRmd, fs_hz: float):
         self.spec, self.fs_hz = spec, fs_hz
-        self.variance_m2: dict[str, float] = {}
-        self._differences: dict[str, np.ndarray] = {}
-        self._last: dict[str, tuple[int, float]] = {}
+        self._held: dict[str, tuple[list[np.ndarray], Any]] = {}
+        self._rings: dict[str, tuple[np.ndarray, np.ndarray]] = {}
 
-    def hear(self, name: str, epochs: np.ndarray, loops, steered: bool = False) -> None:
-        """``epochs``: EPOCH rows of satellite ``name``; ``loops``: its tracking Spec; ``steered``: from outside."""
-        locked = epochs[epochs["state"] == STATE_LOCKED]
-        if not len(locked):
-            self._last.pop(name, None)
-            return
-        error = METRES_PER_CHIP * locked["code_error_chips"].astype(float)
-        begin = locked["sample_index"].astype(np.int64)
-        end = begin + locked["n_samples"]
-        before, last = self._last.get(name, (-1, 0.0))
-        joined = np.concatenate([[before], end[:-1]]) == begin
-        d = np.diff(np.concatenate([[last], error]))[joined]
-        self._last[name] = int(end[-1]), float(error[-1])
-        window = self.spec.window
-        kept = np.concatenate([self._differences.get(name, np.zeros(0)), d])[-window:]
-        self._differences[name] = kept
-        if len(kept) < window:
-            return
-        mean = window_variance(kept, window, SCHEMES[self.spec.scheme], self.spec.decay)
-        t_s = float(locked["n_samples"][-1]) / self.fs_hz
-        gain = code_gain(name[0], loops.early_late_space_chips, round(float(locked["cn0_dbhz"][-1])), t_s)
-        share = loop_share(0.0 if steered else loops.dll_bw_hz, t_s, gain)
-        self.variance_m2[name] = mean * share + self.spec.r0_m2
+    def hear(self, name: str, epochs: np.ndarray, loops: Any) -> None:
+        """``epochs``: EPOCH rows of satellite ``name``; ``loops``: its tracking Spec."""
+        self._held.setdefault(name, ([], loops))[0].append(epochs.copy())
+
+    def estimate(self, steered: bool = False) -> dict[str, float]:
+        """Variances, m^2, by satellite, of those heard since the last call; ``steered``: from outside."""
+        out = {}
+        for name, (parts, loops) in self._held.items():
+            epochs = np.concatenate(parts)
+            ring, state = self._rings.setdefault(
+                name, (np.zeros(self.spec.window), np.array([0.0, -1.0, 0.0]))
+            )
+            follow(epochs, ring, state)
+            last = epochs[-1]
+            if state[0] < self.spec.window or last["state"] != STATE_LOCKED:
+                continue
+            args = SCHEMES[self.spec.scheme], self.spec.decay
+            mean = window_variance(ring, int(state[0]), *args) * METRES_PER_CHIP**2
+            t_s = float(last["n_samples"]) / self.fs_hz
+            gain = code_gain(name[0], loops.early_late_space_chips, round(float(last["cn0_dbhz"])), t_s)
+            out[name] = mean * loop_share(0.0 if steered else loops.dll_bw_hz, t_s, gain) + self.spec.r0_m2
+        self._held.clear()
+        return out
 
 
 def loop_share(dll_bw_hz: float, integration_s: float, gain: float = 1.0) -> float:

@@ -116,7 +116,7 @@ class IntegrityLive:
     def hear(self, name: str, epochs: np.ndarray, loops: Any) -> None:
         """New integrations of one channel."""
         if self._noise is not None:
-            self._noise.hear(name, epochs, loops, self.steered is not None)
+            self._noise.hear(name, epochs, loops)
 
     # -- one epoch ----------------------------------------------------------------------------------------------------
 
@@ -159,7 +159,7 @@ class IntegrityLive:
         """Noise by redundant measurements, which is that of one integration; a normal point is the mean of several."""
         if self._noise is None or self.spec.noise_rmd is None:
             return
-        known = self._noise.variance_m2
+        known = self._noise.estimate(self.steered is not None)
         if not known or snap is None:
             self.alarms["noise_rmd"].lack("no channel has filled its window of differences yet")
             return

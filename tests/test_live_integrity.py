@@ -177,7 +177,7 @@ def test_redundant_measurements_tell_the_noise_of_a_first_order_loop():
     epochs["state"], epochs["code_error_chips"], epochs["cn0_dbhz"] = STATE_LOCKED, error, 60.0
     spec = ReceiverSpec(tracking={"l1ca": {"dll_bw_hz": bt_hz}})
     run.hear("G01", epochs, spec.tracking.l1ca)
-    got = run._noise.variance_m2["G01"] / METRES_PER_CHIP**2
+    got = run._noise.estimate()["G01"] / METRES_PER_CHIP**2
     # Relative standard error of both mean squares below sqrt(2/n) times a correlation factor of 2.
     assert abs(got / x.var() - 1) < Z * 2 * np.sqrt(2 / n)
     assert abs(x.var() - a / (2 - a)) < Z * 2 * np.sqrt(2 / n) * a / (2 - a)
