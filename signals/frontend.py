@@ -275,14 +275,10 @@ class FrontEnd:
 
     def _impair(self, imp: ImpairmentSpec, iq: np.ndarray) -> None:
         """Spurs, imbalance and DC, in place."""
-        fs_hz, n0, n = self.spec.fs_hz, self._out, iq.shape[1]
-        seconds = np.arange(int(n0 / fs_hz), int((n0 + n) / fs_hz) + 2)
+        fs_hz, n0 = self.spec.fs_hz, self._out
         for spur in imp.spurs:
             freq_hz = spur.freq_hz + self.spec.if_hz
-            level = np.array([math.sqrt(2.0) * 10 ** (spur.power_db / 20)], np.float32)
-            carrier = np.zeros((len(seconds), 4))
-            carrier[:, 0], carrier[:, 1] = np.mod(freq_hz * seconds, 1.0), freq_hz
-            add_tone(iq, n0, n0, n0 + n, level, int(seconds[0]), fs_hz, carrier, fs_hz, 1.0, 0.0, False)
+            add_tone(iq, n0, freq_hz / fs_hz, np.float32(math.sqrt(2.0) * 10 ** (spur.power_db / 20)))
         if imp.iq_gain_db or imp.iq_phase_deg:
             g, p = 10 ** (imp.iq_gain_db / 20), math.radians(imp.iq_phase_deg)
             iq[1] = np.float32(g * math.cos(p)) * iq[1] + np.float32(g * math.sin(p)) * iq[0]

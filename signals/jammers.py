@@ -6,13 +6,15 @@ density itself. It is the power of the complex envelope, before the front end; o
 a pulse lasts. ``profile`` adds dB, a line between its points (t_s, db).
 
 Frequency. ``freq_hz`` from the carrier, moving by ``rate_hz_s`` from the start on; or a line of a code spectrum.
-Every wave depends on the absolute sample index alone, so that any chunking gives the same bits.
+A jammer is a carrier times an `Envelope`; both depend on the absolute sample index alone, so that any chunking gives
+the same bits. Envelopes that the kernels know are added inside the synthesis; any other is a function of the sample
+index (``Envelope.samples``), as that of `Interferer`.
 """
 
 import itertools
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Annotated, Any, Literal
 
@@ -21,15 +23,18 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from signals import jammer_kernels as kernels
 from signals.constants import CHIP_RATE_HZ, F_L1_HZ
+from signals.kernels import COMPONENT, SUB
 from signals.modulation import BLOCK, SIGNALS, chip_waveform, code_lines
 from signals.records import JAMMER_TRUTH
 from signals.sky import Sky
-from signals.source import CELLS_PER_S, amplitude, hermite_cells
+from signals.source import CELLS_PER_S, Cells, amplitude, hermite_cells
+from signals.synthesis_kernels import synthesise
 
 __all__ = [
     "CW",
     "Chirp",
     "CodeLine",
+    "Envelope",
     "Interferer",
     "JammerRun",
     "JammerSpec",
@@ -45,11 +50,30 @@ _MAX_LINE = 8
 _PULSE_S = 1.0 / math.sqrt(4.5e11)
 """Width of a DME pulse exp(-alpha t^2 / 2), alpha = 4.5e11 / s^2 (RTCA DO-292; 3.5 us between half-amplitude
 points)."""
+_SHORT_SWEEP = 1 << 17
+_SWEEP_TABLE = 1 << 20
+"""Values in the table of a short sweep: 4 MB."""
 _CODE_CHIPS = 40_920
 """Length of the noise-like code of `MatchedSpectrum`: 40 ms, longer than the integrations."""
 
 Opener = Callable[[str, float], tuple[Callable[[int, int], np.ndarray], int]]
 """(path, fs_hz) -> (reader(n0, n) -> planar float32 (2, n), length of the file); refuses a file of another rate."""
+
+
+@dataclass(frozen=True, eq=False)
+class Envelope:
+    """What a jammer is but for its carrier, its power and its times: amplitude 1 while it is on."""
+
+    kind: int = kernels.TONE
+    duty: float = 1.0
+    """Mean power."""
+    fields: dict[str, Any] = field(default_factory=dict)
+    """Of its JAMMER row."""
+    codes: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int8))
+    waves: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int16))
+    taps: np.ndarray = field(default_factory=lambda: np.zeros(0, np.float32))
+    samples: Callable[[int, int], np.ndarray] | None = None
+    """(n0, n) -> planar (2, n): an envelope that the kernels do not know (``kind`` stays TONE)."""
 
 
 class CodeLine(BaseModel):
@@ -145,9 +169,9 @@ class _Jammer(BaseModel):
         """Bandwidth that it occupies about its centre."""
         return 0.0
 
-    def wave(self, fs_hz: float, seed: np.uint64, context: dict[str, Any]) -> tuple[Callable, tuple, float]:
-        """(kernel, its further arguments, duty): what a new jammer has to say. The kernel gets (iq, n0, lo, hi,
-        level, cell0, n_cell, carrier) and those; unit amplitude while on; duty is its mean power.
+    def envelope(self, fs_hz: float, seed: np.uint64, context: dict[str, Any]) -> Envelope:
+        """What a new jammer has to say. ``context``: "carrier_hz" of its centre in the samples, None if that
+        moves; "open_recording".
         """
         raise NotImplementedError
 
@@ -172,16 +196,19 @@ class _Jammer(BaseModel):
         phase_cycles = phase / 2.0**64 if self.phase_rad is None else self.phase_rad / (2 * math.pi)
         line_hz = 0.0 if self.line is None else self.line.freq_hz(code_path)
         jn0_dbhz = self._jn0_dbhz(sky, fs_hz)
-        kernel, args, duty = self.wave(
-            fs_hz, key, {"open_recording": open_recording, "center_hz": if_hz + self.freq_hz + line_hz}
+        moves = self.rate_hz_s != 0.0 or (
+            self.line is not None and (self.line.rate_hz_s or self.line.follow_doppler)
         )
+        offset_hz = self.freq_hz if self.line is None else self.line.offset_hz
+        carrier_hz = None if moves else if_hz + line_hz + offset_hz
+        envelope = self.envelope(fs_hz, key, {"open_recording": open_recording, "carrier_hz": carrier_hz})
         run = JammerRun(
             self, fs_hz, if_hz, jn0_dbhz, float(amplitude(jn0_dbhz, fs_hz, is_complex)),
             math.ceil(self.start_s * fs_hz - 1e-6),
             2**62 if self.stop_s is None else math.ceil(self.stop_s * fs_hz - 1e-6),
-            line_hz, phase_cycles, self._follow(sky), duration_s, kernel, args,
+            line_hz, phase_cycles, self._follow(sky), duration_s, envelope, key,
         )  # fmt: skip
-        run.rms = math.sqrt(0.5 * duty * run.mean_power(duration_s))
+        run.rms = math.sqrt(0.5 * envelope.duty * run.mean_power(duration_s))
         run.check(duration_s, is_complex)
         return run
 
@@ -219,13 +246,17 @@ class CW(_Jammer):
 
     kind: Literal["CW"] = "CW"
 
-    def wave(self, fs_hz, seed, context):
-        """See `_Jammer.wave`."""
-        return kernels.add_tone, (fs_hz, 1.0, 0.0, False), 1.0
+    def envelope(self, fs_hz, seed, context):
+        """See `_Jammer.envelope`."""
+        return Envelope()
 
 
 class Chirp(_Jammer):
-    """A tone swept over ``sweep_hz`` about its centre in ``sweep_s``: up and again (sawtooth), or up and down."""
+    """A tone swept over ``sweep_hz`` about its centre in ``sweep_s``: up and again (sawtooth), or up and down.
+
+    Sweeps of up to 131,072 samples come from a table whose rows begin 1/P of a sample apart, with P (M + 1032) up to 2^20
+    and P up to 256: an error of 2e-3 to 6e-3 rad at most, -44 dB. Longer ones, and those whose centre moves, are exact.
+    """
 
     kind: Literal["Chirp"] = "Chirp"
     sweep_hz: float = Field(gt=0.0, le=100e6)
@@ -240,9 +271,28 @@ class Chirp(_Jammer):
         """The sweep."""
         return self.sweep_hz
 
-    def wave(self, fs_hz, seed, context):
-        """See `_Jammer.wave`."""
-        return kernels.add_tone, (fs_hz, self.sweep_s, self.sweep_hz, self.shape == "triangular"), 1.0
+    def envelope(self, fs_hz, seed, context):
+        """See `_Jammer.envelope`."""
+        length, sweep, two = self.sweep_s * fs_hz, self.sweep_hz / fs_hz, self.shape == "triangular"
+        fields = {"period": length, "sweep": sweep, "triangular": two}
+        if length > _SHORT_SWEEP or context["carrier_hz"] is None:
+            return Envelope(kernels.SWEEP, fields=fields)
+        carrier = context["carrier_hz"] / fs_hz
+        wave = _sweep_table(length, sweep, two, carrier)
+        fields |= {"carrier": carrier, "rows": wave.shape[1], "columns": wave.shape[2]}
+        return Envelope(kernels.CHIRP, fields=fields, waves=wave.ravel())
+
+
+def _sweep_table(length: float, sweep: float, triangular: bool, carrier: float) -> np.ndarray:
+    """Short sweeps of so many samples and cycles per sample, carrier included: int16 (2, P, columns)."""
+    columns = math.ceil(length * (2 if triangular else 1)) + BLOCK + 8
+    rows = int(2 ** min(math.floor(math.log2(_SWEEP_TABLE / columns)), 8))
+    place = np.arange(columns) + np.arange(rows)[:, None] / rows
+    turn, tau = np.divmod(place, length)
+    sign = np.where(turn % 2 == 1, -1.0, 1.0) if triangular else 1.0
+    turns = 0.5 * sign * sweep * tau * (tau / length - 1.0) + carrier * place
+    angle = 2 * math.pi * np.mod(turns, 1.0)
+    return np.round(kernels.WAVE_SCALE * np.stack([np.cos(angle), np.sin(angle)])).astype(np.int16)
 
 
 class Pulsed(_Jammer):
@@ -283,15 +333,12 @@ class Pulsed(_Jammer):
         """Between the -20 dB points of a DME pulse; first nulls of a rectangle."""
         return 0.68 / _PULSE_S if self.duty is None else 2.0 * self.rate_hz / self.duty
 
-    def wave(self, fs_hz, seed, context):
-        """See `_Jammer.wave`."""
-        slot_s = 1.0 / self.rate_hz
+    def envelope(self, fs_hz, seed, context):
+        """See `_Jammer.envelope`."""
+        fields = {"period": fs_hz / self.rate_hz, "random": self.random}
         if self.duty is not None:
-            return (
-                kernels.add_pulses,
-                (fs_hz, seed, slot_s, self.duty * slot_s, 0.0, False, self.random),
-                self.duty,
-            )
+            fields |= {"width": self.duty * fs_hz / self.rate_hz}
+            return Envelope(kernels.PULSES, self.duty, fields)
         # Mean of (g(t) + g(t - D))^2: two pulses of energy sqrt(pi) w, and the overlap.
         pulses = (
             1.0
@@ -299,15 +346,15 @@ class Pulsed(_Jammer):
             else 2.0 + 2.0 * math.exp(-((self.pair_spacing_s / _PULSE_S) ** 2) / 4)
         )
         duty = pulses * math.sqrt(math.pi) * _PULSE_S * self.rate_hz
-        args = (fs_hz, seed, slot_s, _PULSE_S, self.pair_spacing_s, True, self.random)
-        return kernels.add_pulses, args, duty
+        fields |= {"width": _PULSE_S * fs_hz, "pair": self.pair_spacing_s * fs_hz, "gaussian": True}
+        return Envelope(kernels.PULSES, duty, fields)
 
 
 class Narrowband(_Jammer):
-    """Circular Gaussian noise, flat over ``bandwidth_hz`` between its half-amplitude points.
+    """Circular Gaussian noise, flat over ``bandwidth_hz``: its noise bandwidth, power over density at the centre.
 
-    White points on a lattice of fs / D >= 1.2 B under a 16-point Kaiser-windowed sinc (stop band -50 dB; edges of
-    +-0.09 fs / D), keyed by their absolute index.
+    White points on a lattice of fs / D >= 1.2 B, D a power of two, under a 12-point Kaiser-windowed sinc (stop band
+    -50 dB; edges of +-0.13 fs / D), keyed by their absolute index; finer by doublings and cubics where D > 2 (images -50 dB).
     """
 
     kind: Literal["Narrowband"] = "Narrowband"
@@ -321,37 +368,42 @@ class Narrowband(_Jammer):
 
     def lattice(self, fs_hz: float) -> tuple[int, int]:
         """(phases of the filter, samples between its outputs); their product is D."""
-        spacing = max(int(fs_hz / (1.2 * self.bandwidth_hz)), 1)
-        step = -(-spacing // kernels.MAX_PHASES)
-        return spacing // step, step
+        spacing = max(int(math.log2(max(fs_hz / (1.2 * self.bandwidth_hz), 1.0))), 0)
+        return 2 ** min(spacing, 1), 2 ** max(spacing - 1, 0)
 
     def response(self, fs_hz: float) -> np.ndarray:
-        """Impulse response on the fine grid, unit energy per lattice point: float64 (N_TAPS * phases,)."""
+        """Impulse response on the grid of the filter's outputs, N_TAPS * phases: unit mean power after the cubics."""
         phases, step = self.lattice(fs_hz)
         n = kernels.N_TAPS * phases
         u = (np.arange(n) - n // 2) / phases
-        cut = self.bandwidth_hz / fs_hz * phases * step
-        h = np.sinc(cut * u) * np.kaiser(n + 1, 5.0)[:n]
-        return h * math.sqrt(phases / np.sum(h**2))
+        wanted = cut = self.bandwidth_hz / fs_hz * phases * step
+        for _ in range(
+            4
+        ):  # the window's skirts take power from the band: widen it until its noise bandwidth is right
+            h = np.sinc(cut * u) * np.kaiser(n + 1, 4.5)[:n]
+            cut = min(cut * wanted * np.sum(h) ** 2 / (np.sum(h**2) * phases), 1.0)
+        fine, steps = finer(h, step)
+        return h * math.sqrt(phases * steps / np.sum(fine**2))
 
-    def wave(self, fs_hz, seed, context):
-        """See `_Jammer.wave`."""
+    def envelope(self, fs_hz, seed, context):
+        """See `_Jammer.envelope`."""
         phases, step = self.lattice(fs_hz)
         h = self.response(fs_hz)
-        width = phases * -(-64 // phases)
-        p = np.arange(width) % phases
         # Output j takes points j // phases - T / 2 + 1 .. + T / 2: tap t weighs the point t - T / 2 + 1.
-        taps = np.stack([h[p + (kernels.N_TAPS - 1 - t) * phases] for t in range(kernels.N_TAPS)])
-        args = (seed, np.ascontiguousarray(taps, np.float32), phases, step, context["center_hz"] == 0.0)
-        # Lines between points: the mean power of a line is below that of its ends, (2 + rho) / 3 as steps -> inf.
-        rho = _autocorrelation(h, phases)
-        duty = float(np.mean([(1 - x) ** 2 + x**2 + 2 * x * (1 - x) * rho for x in np.arange(step) / step]))
-        return kernels.add_narrowband, args, duty
+        place = np.arange(phases)[:, None] + np.arange(kernels.N_TAPS)[::-1] * phases
+        fields = {"phases": phases, "step": step}
+        return Envelope(kernels.NARROW, fields=fields, taps=h[place].ravel().astype(np.float32))
 
 
-def _autocorrelation(h: np.ndarray, phases: int) -> float:
-    """Correlation of neighbouring outputs of the interpolator."""
-    return float(np.dot(h[1:], h[:-1]) / phases)
+def finer(h: np.ndarray, step: int) -> tuple[np.ndarray, int]:
+    """Impulse response after the doublings, 64-fold at most, and how much finer its grid is."""
+    a, b, c = kernels.HALFWAY
+    steps, between = 1, np.array([c, 0, b, 0, a, 1, a, 0, b, 0, c])
+    while steps < min(step, 64):
+        up = np.zeros(2 * len(h))
+        up[::2] = h
+        h, steps = np.convolve(up, between), 2 * steps
+    return h, steps
 
 
 class Wideband(_Jammer):
@@ -359,16 +411,9 @@ class Wideband(_Jammer):
 
     kind: Literal["Wideband"] = "Wideband"
 
-    def wave(self, fs_hz, seed, context):
-        """See `_Jammer.wave`."""
-        return _without_carrier(kernels.add_wideband), (seed,), 1.0
-
-
-def _without_carrier(kernel):
-    def add(iq, n0, lo, hi, level, cell0, n_cell, carrier, *args):
-        kernel(iq, n0, lo, hi, level, *args)
-
-    return add
+    def envelope(self, fs_hz, seed, context):
+        """See `_Jammer.envelope`."""
+        return Envelope(kernels.WIDE)
 
 
 class MatchedSpectrum(_Jammer):
@@ -383,9 +428,11 @@ class MatchedSpectrum(_Jammer):
         """The main lobe, or both of them."""
         return (2.0 if self.waveform == "BPSK" else 4.0) * CHIP_RATE_HZ
 
-    def wave(self, fs_hz, seed, context):
-        """See `_Jammer.wave`."""
-        return kernels.add_code, (seed, *_random_code(int(seed), fs_hz, self.waveform)), 1.0
+    def envelope(self, fs_hz, seed, context):
+        """See `_Jammer.envelope`."""
+        table, period = _random_code(int(seed), fs_hz, self.waveform)
+        fields = {"period": period, "rows": table.shape[0], "columns": table.shape[1]}
+        return Envelope(kernels.CODE, fields=fields, codes=table.ravel())
 
 
 def _random_code(seed: int, fs_hz: float, waveform: str) -> tuple[np.ndarray, float]:
@@ -415,8 +462,8 @@ class Interferer(_Jammer):
     power_window_s: float = Field(1.0, gt=0.0, le=60.0)
     """Length over which its power is measured."""
 
-    def wave(self, fs_hz, seed, context):
-        """See `_Jammer.wave`."""
+    def envelope(self, fs_hz, seed, context):
+        """See `_Jammer.envelope`."""
         if context["open_recording"] is None:
             raise ValueError(f"interferer '{self.path}' cannot be opened here: run it from a scenario")
         read, n_file = context["open_recording"](self.path, fs_hz)
@@ -425,7 +472,7 @@ class Interferer(_Jammer):
             raise ValueError(
                 f"interferer '{self.path}' begins with {self.power_window_s:g} s of zeros: it has no power"
             )
-        return _file_adder(read, n_file, self.repeat, power, int(self.start_s * fs_hz)), (), 1.0
+        return Envelope(samples=_from_file(read, n_file, self.repeat, power, int(self.start_s * fs_hz)))
 
 
 def _mean_power(read, n: int) -> float:
@@ -435,25 +482,20 @@ def _mean_power(read, n: int) -> float:
     return total / n
 
 
-def _file_adder(read, n_file: int, repeat: bool, power: float, first: int):
-    def add(iq, n0, lo, hi, level, cell0, n_cell, carrier):
-        begin, end = lo // BLOCK * BLOCK, -(-hi // BLOCK) * BLOCK
-        rotation = np.zeros((2, end - begin), np.float32)
-        kernels.add_tone(rotation, begin, begin, end, level, cell0, n_cell, carrier, 1.0, 1.0, 0.0, False)
-        at = lo
-        while at < hi:
-            place = at - first
-            if not repeat and place >= n_file:
-                return
-            take = min(hi - at, n_file - place % n_file)
-            x = read(place % n_file, take) / np.float32(math.sqrt(power))
-            c, s = rotation[:, at - begin : at - begin + take]
-            out = iq[:, at - n0 : at - n0 + take]
-            out[0] += x[0] * c - x[1] * s
-            out[1] += x[0] * s + x[1] * c
-            at += take
+def _from_file(read, n_file: int, repeat: bool, power: float, first: int):
+    """Envelope of a file that begins at sample ``first``; zeros before it, and after it unless it repeats."""
 
-    return add
+    def samples(n0: int, n: int) -> np.ndarray:
+        out = np.zeros((2, n), np.float32)
+        at = max(n0, first)
+        while at < n0 + n and (repeat or at - first < n_file):
+            place = (at - first) % n_file
+            take = min(n0 + n - at, n_file - place)
+            out[:, at - n0 : at - n0 + take] = read(place, take) / np.float32(math.sqrt(power))
+            at += take
+        return out
+
+    return samples
 
 
 @dataclass(eq=False)
@@ -473,42 +515,58 @@ class JammerRun:
     sky: Sky | None
     """The one satellite whose Doppler is followed."""
     duration_s: float
-    kernel: Callable
-    args: tuple
+    envelope: Envelope
+    seed: np.uint64
     rms: float = 0.0
     """Root of the mean power per component over the run."""
 
     def __post_init__(self) -> None:
-        self._cells = lru_cache(maxsize=8)(self._second)
+        self.row = np.zeros(1, kernels.JAMMER)
+        for name, value in self.envelope.fields.items():
+            self.row[name] = value
+        self.row["kind"], self.row["seed"] = self.envelope.kind, self.seed
+        self.row["n_on"], self.row["n_off"] = self.n_on, self.n_off
+        self.fused = self.envelope.samples is None
+        """True where the synthesis adds it itself (``row``, ``carrier``, ``level``)."""
+        self._grid = Cells(self.fs_hz)
+        self.carrier = lru_cache(maxsize=8)(self._carrier)
+        """Phase in cycles over the cells of a second."""
+        self._wave = lru_cache(maxsize=4)(self._make)
 
     def add(self, iq: np.ndarray, n0: int) -> None:
-        """Add the samples n0, n0 + 1, .. to float32 (2, n)."""
-        lo, hi = max(n0, self.n_on), min(n0 + iq.shape[1], self.n_off)
-        if lo >= hi:
-            return
-        n_cell = self.fs_hz / CELLS_PER_S
-        b0, b1 = lo // BLOCK, -(-hi // BLOCK)
-        # Base tables belong to whole groups of blocks, whatever part of them is asked for.
-        group = kernels.GROUP * BLOCK
-        cell0, cell1 = (
-            int(b0 * BLOCK // group * group / n_cell),
-            int((b1 * BLOCK // group + 1) * group / n_cell),
-        )
-        first, last = cell0 // CELLS_PER_S, cell1 // CELLS_PER_S
-        carrier = (
-            self._cells(first)
-            if first == last
-            else np.concatenate([self._cells(k) for k in range(first, last + 1)])
-        )
-        self.kernel(
-            iq, n0, lo, hi, self._level(b0, b1), first * CELLS_PER_S, n_cell, carrier, *self.args
-        )  # fmt: skip
+        """Add the samples n0, n0 + 1, .. to float32 (2, n); cells are made whole and kept."""
+        at, end = n0, n0 + iq.shape[1]
+        while at < end:
+            first, wave = self._wave(self._grid.holding(at))
+            to = min(end, first + wave.shape[1])
+            if to > self.n_on and at < self.n_off:
+                iq[:, at - n0 : to - n0] += wave[:, at - first : to - first]
+            at = to
 
-    def _level(self, b0: int, b1: int) -> np.ndarray:
-        """Amplitude at the edges of blocks b0 .. b1."""
+    def _make(self, cell: int) -> tuple[int, np.ndarray]:
+        """First sample of a cell and its samples, float32 (2, n)."""
+        b0, b1, n_start = self._grid.place(cell)
+        first, n = b0 * BLOCK, (b1 - b0) * BLOCK
+        out, no = np.zeros((2, n), np.float32), np.zeros((0, 4))
+        if first >= self.n_off or first + n <= self.n_on:
+            return first, out
+        second, k = divmod(cell, CELLS_PER_S)
+        e = self.envelope
+        synthesise(
+            out, np.zeros((2, 0), np.int8), np.float32(1), np.uint64(0), np.float32(0), first, n_start, self._grid.n_cell,
+            np.zeros(0, COMPONENT), no, no, no, np.zeros(0, np.int64), np.zeros(0, np.int8), np.zeros(0, np.int8),
+            self.row, self.carrier(second)[k : k + 1], self.level(b0, b1)[None, :], e.codes, e.waves, e.taps,
+        )  # fmt: skip
+        if e.samples is None:
+            return first, out
+        x, y = e.samples(first, n)
+        return first, np.stack([out[0] * x - out[1] * y, out[0] * y + out[1] * x])
+
+    def level(self, b0: int, b1: int) -> np.ndarray:
+        """Amplitude over blocks b0 .. b1 - 1: float32, one value or one per SUB samples."""
         if not self.spec.profile:
             return np.array([self.amplitude], np.float32)
-        t_s = np.arange(b0, b1 + 1) * (BLOCK / self.fs_hz)
+        t_s = (np.arange(b0 * BLOCK, b1 * BLOCK, SUB) + SUB / 2) / self.fs_hz
         return (self.amplitude * 10 ** (self.profile_db(t_s) / 20)).astype(np.float32)
 
     def profile_db(self, t_s) -> np.ndarray:
@@ -524,7 +582,7 @@ class JammerRun:
         line = self.spec.line
         return (self.spec.freq_hz, self.spec.rate_hz_s) if line is None else (line.offset_hz, line.rate_hz_s)
 
-    def _second(self, second: int) -> np.ndarray:
+    def _carrier(self, second: int) -> np.ndarray:
         """Phase in cycles over the 50 cells of a second: cubics (50, 4) in x."""
         begin = second + np.arange(CELLS_PER_S) / CELLS_PER_S
         since, d = begin - self.spec.start_s, 1.0 / CELLS_PER_S

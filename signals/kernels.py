@@ -1,4 +1,4 @@
-"""Sample synthesis: thermal noise, satellites and the quantiser.
+"""Parts of the synthesis: thermal noise, satellites and the quantiser; `signals.synthesis_kernels` joins them.
 
 Samples have an absolute index n and are made in blocks of BLOCK that start at multiples of BLOCK, always whole,
 so that every sample has the same bits whatever the chunking or the number of threads. Over a *cell* of time
@@ -20,12 +20,12 @@ intrinsic: Any = _intrinsic  # its stub does not know that the typing context is
 
 __all__ = [
     "COMPONENT",
+    "add_noise",
     "noise_block",
+    "noise_span",
     "quantise_bits",
     "quantise_int8",
     "quantise_int16",
-    "synthesise",
-    "synthesise_int8",
 ]
 
 SUB = 256
@@ -106,6 +106,27 @@ def _prefetch(typingctx, array, index):
     return types.void(array, index), codegen
 
 
+@intrinsic
+def borrowed(typingctx, array):
+    """The same array without its reference counter, whose atomic changes cost more than a jammer.
+
+    Whoever owns the memory has to be kept (`keep`) until the last use.
+    """
+
+    def codegen(ctx, b, sig, args):
+        view = ctx.make_array(sig.args[0])(ctx, b, args[0])
+        view.meminfo = cgutils.get_null_value(view.meminfo.type)
+        return view._getvalue()
+
+    return array(array), codegen
+
+
+@intrinsic
+def keep(typingctx, array):
+    """A last use of an array that is borrowed from."""
+    return types.void(array), lambda ctx, b, sig, args: ctx.get_dummy_value()
+
+
 @njit(cache=True, nogil=True)
 def _splitmix64(z):
     """Finaliser of splitmix64 (Steele, Lea, Flood, OOPSLA 2014, fig. 17)."""
@@ -115,46 +136,81 @@ def _splitmix64(z):
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST)
-def noise_block(out_i, out_q, hash1, hash2, seed, block, sigma):
-    """Write BLOCK complex Gaussian samples that depend on (seed, block) alone; sigma^2 is the variance of I and of Q.
+def _hashes(hash1, hash2, seed, block, begin, n):
+    """Two 32-bit hashes of the places begin .. begin + n - 1 in a block, under the block's 64-bit key.
 
-    Two 32-bit hashes of the sample's place in the block under the block's 64-bit key (splitmix64 of seed and
-    block index), then Box and Muller: r = sqrt(-2 ln u), angle in half a turn and a random sign. Range +-6.5 sigma.
-
-    Hashes: triple32 (C. Wellons, "Prospecting for hash functions", 2018) and the finaliser of MurmurHash3
-    (A. Appleby). Polynomials: minimax, error of log2 below 3e-6, of sine and cosine below 7e-7.
+    The key is splitmix64 of seed and block index; the hashes are triple32 (C. Wellons, "Prospecting for hash
+    functions", 2018) and the finaliser of MurmurHash3 (A. Appleby) upon it.
     """
     key = _splitmix64(_splitmix64(seed + _Q(0x9E3779B97F4A7C15)) + (block + _Q(1)) * _Q(0x9E3779B97F4A7C15))
     key1 = _U(key >> _Q(32))
     key2 = _U(key & _Q(0xFFFFFFFF))
-    for k in range(BLOCK):
+    for k in range(begin, begin + n):
         x = _mix(_U(k), key1, _U(17), _U(0xED5AD4BB))
         x = _mix(x, _U(0), _U(11), _U(0xAC4C1B51))
         x = _mix(x, _U(0), _U(15), _U(0x31848BAB))
         x = _mix(x, _U(0), _U(14), _U(1))
         y = _mix(x, key2, _U(16), _U(0x85EBCA6B))
         y = _mix(y, _U(0), _U(13), _U(0xC2B2AE35))
-        hash1[k] = x
-        hash2[k] = _mix(y, _U(0), _U(16), _U(1))
+        hash1[_Q(k - begin)] = x
+        hash2[_Q(k - begin)] = _mix(y, _U(0), _U(16), _U(1))
+
+
+@njit(cache=True, nogil=True, fastmath=_FAST)
+def _gaussian(h, g):
+    """Two Gaussian numbers from two hashes (Box and Muller): r = sqrt(-2 ln u), angle in half a turn and a random
+    sign. Range +-6.5.
+
+    Polynomials: minimax, error of log2 below 3e-6, of sine and cosine below 7e-7.
+    """
+    bits = _bits(_F(_I(_I(_I(h >> _I(1)) & _I(0x7FFFFFFF)) | _I(1))))
+    w = _float(_I(_I(bits & _I(0x007FFFFF)) | _I(0x3F800000))) - _F(1)
+    # log2 u = exponent + w + w (1 - w) q(w): exact at both ends, so that r is right near u = 1
+    q = _F(0.44254493) + w * (
+        _F(-0.27560019) + w * (_F(0.18194844) + w * (_F(-0.095955811) + w * _F(0.025841132)))
+    )
+    log2u = _F(_I(bits - _I(0x4F000000))) * _F(2.0**-23) + w * (_F(1) - w) * q
+    r = np.sqrt(max(_F(-1.3862943611) * log2u, _F(0)))
+    a = _F(g) * _F(2.0**-32)  # half turns
+    a2 = a * a
+    s = a * (_F(3.14158203) + a2 * (_F(-5.16714292) + a2 * (_F(2.5419) + a2 * _F(-0.554638688))))
+    c = _F(0.999999953) + a2 * (
+        _F(-4.93479286) + a2 * (_F(4.05841194) + a2 * (_F(-1.33188034) + a2 * _F(0.219697149)))
+    )
+    return r * s, _float(_I(_bits(r) ^ _I(_I(h & _I(1)) << _I(31)))) * c
+
+
+@njit(cache=True, nogil=True, fastmath=_FAST)
+def noise_span(out_i, out_q, at, hash1, hash2, seed, block, begin, n, sigma):
+    """Samples begin .. begin + n - 1 of a block of ``noise_block`` into out[at ..]."""
+    _hashes(hash1, hash2, seed, block, begin, n)
     # A loop of its own: the integer and the float part overlap better than fused (0.9 against 1.35 ns).
+    for k in range(n):
+        x, y = _gaussian(hash1[k], hash2[k])
+        out_i[_Q(at) + _Q(k)] = sigma * x
+        out_q[_Q(at) + _Q(k)] = sigma * y
+
+
+@njit(cache=True, nogil=True, fastmath=_FAST)
+def noise_block(out_i, out_q, hash1, hash2, seed, block, sigma):
+    """Write BLOCK complex Gaussian samples that depend on (seed, block) alone; sigma^2 is the variance of I and of Q."""
+    _hashes(hash1, hash2, seed, block, 0, BLOCK)
     for k in range(BLOCK):
-        h = hash1[k]
-        bits = _bits(_F(_I(_I(_I(h >> _I(1)) & _I(0x7FFFFFFF)) | _I(1))))
-        w = _float(_I(_I(bits & _I(0x007FFFFF)) | _I(0x3F800000))) - _F(1)
-        # log2 u = exponent + w + w (1 - w) q(w): exact at both ends, so that r is right near u = 1
-        q = _F(0.44254493) + w * (
-            _F(-0.27560019) + w * (_F(0.18194844) + w * (_F(-0.095955811) + w * _F(0.025841132)))
-        )
-        log2u = _F(_I(bits - _I(0x4F000000))) * _F(2.0**-23) + w * (_F(1) - w) * q
-        r = sigma * np.sqrt(max(_F(-1.3862943611) * log2u, _F(0)))
-        a = _F(hash2[k]) * _F(2.0**-32)  # half turns
-        a2 = a * a
-        s = a * (_F(3.14158203) + a2 * (_F(-5.16714292) + a2 * (_F(2.5419) + a2 * _F(-0.554638688))))
-        c = _F(0.999999953) + a2 * (
-            _F(-4.93479286) + a2 * (_F(4.05841194) + a2 * (_F(-1.33188034) + a2 * _F(0.219697149)))
-        )
-        out_i[k] = r * s
-        out_q[k] = _float(_I(_bits(r) ^ _I(_I(h & _I(1)) << _I(31)))) * c
+        x, y = _gaussian(hash1[k], hash2[k])
+        out_i[k] = sigma * x
+        out_q[k] = sigma * y
+
+
+@njit(cache=True, nogil=True, fastmath=_FAST)
+def add_noise(out_i, out_q, hash1, hash2, seed, block, sigma, begin, end):
+    """Add sigma times the samples begin .. end - 1 of a block to what is there; its hashes are made with the first."""
+    if begin == 0:
+        _hashes(hash1, hash2, seed, block, 0, BLOCK)
+    for m in range(end - begin):
+        k = _Q(begin) + _Q(m)
+        x, y = _gaussian(hash1[k], hash2[k])
+        out_i[k] += sigma * x
+        out_q[k] += sigma * y
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST)
@@ -365,88 +421,3 @@ def quantise_bits(x, out, gain, bits):
         for k in range(x.shape[1]):
             level = np.floor(min(max(gain * x[r, k], -top), top - _F(0.5)))
             out[r, k] = np.int8(_I(_F(2) * level + _F(1)))
-
-
-@njit(cache=True, nogil=True, fastmath=_FAST)
-def synthesise(
-    out, seed, sigma, n_first, n_start, n_cell, components, code, carrier, amplitude, period, codes, symbols
-):
-    """Noise and components of whole blocks of one cell, float32.
-
-    Parameters
-    ----------
-    out : float32 (2, n), n a multiple of BLOCK
-    seed : uint64
-    sigma : float32
-        Standard deviation of the thermal noise per component; 0 = none.
-    n_first : int
-        Absolute index of the first sample, a multiple of BLOCK.
-    n_start, n_cell : float
-        Samples from the cell's beginning to it, and in the cell.
-    components : COMPONENT (C,)
-    code, carrier : float64 (C, 4)
-        Code phase in chips and carrier phase in cycles (IF included): polynomials in x, 0 <= x < 1 over the cell.
-    amplitude : float64 (C, 4)
-        Complex amplitude (re0 + x re1) + i (im0 + x im1).
-    period : int64 (C,)
-        Code period to which ``code[:, 0]`` belongs.
-    codes, symbols : int8
-        Flat buffers of code tables and symbols.
-    """
-    n_blocks = out.shape[1] // BLOCK
-    base = np.empty(len(components) * 2 * SUB, np.float32)
-    rot_i = np.empty(len(components) * n_blocks * (BLOCK // SUB), np.float32)
-    rot_q = np.empty_like(rot_i)
-    _carrier_bases(base, carrier, n_cell)
-    _rotations(rot_i, rot_q, carrier, amplitude, n_start, n_cell)
-    where = np.empty((n_blocks, len(components), 3), np.int64)
-    weight = np.empty((n_blocks, len(components), 4), np.float32)
-    _plan(where, weight, components, code, period, symbols, n_start, n_cell)
-    buf_i, buf_q = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
-    hash1, hash2 = np.empty(BLOCK, np.uint32), np.empty(BLOCK, np.int32)
-    for b in range(n_blocks):
-        noise_block(buf_i, buf_q, hash1, hash2, seed, _Q(n_first // BLOCK + b), sigma)
-        if b + 1 < n_blocks:
-            _fetch_ahead(where, b + 1, codes)
-        _add_block(buf_i, buf_q, b, base, rot_i, rot_q, where, weight, codes)
-        for k in range(BLOCK):
-            out[0, _Q(b * BLOCK + k)] = buf_i[k]
-        for k in range(BLOCK):
-            out[1, _Q(b * BLOCK + k)] = buf_q[k]
-
-
-@njit(cache=True, nogil=True, fastmath=_FAST)
-def synthesise_int8(
-    out,
-    gain,
-    seed,
-    sigma,
-    n_first,
-    n_start,
-    n_cell,
-    components,
-    code,
-    carrier,
-    amplitude,
-    period,
-    codes,
-    symbols,
-):
-    """``synthesise`` and ``quantise_int8`` in one pass through the first-level cache; the same bits."""
-    n_blocks = out.shape[1] // BLOCK
-    base = np.empty(len(components) * 2 * SUB, np.float32)
-    rot_i = np.empty(len(components) * n_blocks * (BLOCK // SUB), np.float32)
-    rot_q = np.empty_like(rot_i)
-    _carrier_bases(base, carrier, n_cell)
-    _rotations(rot_i, rot_q, carrier, amplitude, n_start, n_cell)
-    where = np.empty((n_blocks, len(components), 3), np.int64)
-    weight = np.empty((n_blocks, len(components), 4), np.float32)
-    _plan(where, weight, components, code, period, symbols, n_start, n_cell)
-    buf_i, buf_q = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
-    hash1, hash2 = np.empty(BLOCK, np.uint32), np.empty(BLOCK, np.int32)
-    for b in range(n_blocks):
-        noise_block(buf_i, buf_q, hash1, hash2, seed, _Q(n_first // BLOCK + b), sigma)
-        if b + 1 < n_blocks:
-            _fetch_ahead(where, b + 1, codes)
-        _add_block(buf_i, buf_q, b, base, rot_i, rot_q, where, weight, codes)
-        _quantise_block(buf_i, buf_q, out, b * BLOCK, gain)

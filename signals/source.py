@@ -14,14 +14,16 @@ from signals.constants import CHIP_RATE_HZ, F_L1_HZ
 from signals.faults import FaultySky
 from signals.frontend import FrontEndSpec
 from signals.inav import encode as encode_inav
-from signals.kernels import COMPONENT, synthesise, synthesise_int8
+from signals.jammer_kernels import JAMMER
+from signals.kernels import COMPONENT
 from signals.lnav import encode as encode_lnav
 from signals.modulation import BLOCK, code_table
 from signals.multipath import EchoRun
 from signals.records import ECHO_TRUTH, EPHEMERIS, FAULT_TRUTH, JAMMER_TRUTH, TRUTH
 from signals.sky import Propagation, Satellite, Sky
+from signals.synthesis_kernels import synthesise
 
-__all__ = ["CELLS_PER_S", "SyntheticSource", "amplitude", "hermite_cells", "truth"]
+__all__ = ["CELLS_PER_S", "Cells", "SyntheticSource", "amplitude", "hermite_cells", "truth"]
 
 CELLS_PER_S = 50
 """Cells of 20 ms: a whole number of code periods of every signal, and the grid of the clock noise."""
@@ -45,6 +47,33 @@ def amplitude(cn0_dbhz, fs_hz: float, is_complex: bool = True):
 def _n_phase(fs_hz: float) -> int:
     """Rows of the code tables: a rounding of at most c / (2 P fs) = 0.15 m, in at most 256 rows."""
     return int(2 ** np.clip(math.ceil(math.log2(1e9 / fs_hz)), 5, 8))
+
+
+class Cells:
+    """The cells of a sample rate: a block belongs to the cell that holds its middle, in exact arithmetic."""
+
+    def __init__(self, fs_hz: float):
+        self._num, self._den = Fraction(fs_hz).as_integer_ratio()
+        self.n_cell = fs_hz / CELLS_PER_S
+
+    def first_block(self, cell: int) -> int:
+        """First block with its middle at or after the beginning of the cell."""
+        unit = CELLS_PER_S * BLOCK * self._den
+        return max(-((unit - 2 * self._num * cell) // (2 * unit)), 0)
+
+    def place(self, cell: int) -> tuple[int, int, float]:
+        """First block of the cell, first block after it, and samples from the cell's beginning to its first block."""
+        first = self.first_block(cell)
+        begin = first * BLOCK * CELLS_PER_S * self._den - self._num * cell
+        return first, self.first_block(cell + 1), begin / (CELLS_PER_S * self._den)
+
+    def holding(self, n: int) -> int:
+        """Cell of the block that holds sample n."""
+        return (2 * (n // BLOCK) + 1) * BLOCK * CELLS_PER_S * self._den // (2 * self._num)
+
+    def count(self, n: int) -> int:
+        """Cells that hold the samples 0 .. n - 1."""
+        return self.holding(n - 1) + 1
 
 
 class SyntheticSource:
@@ -89,11 +118,12 @@ class SyntheticSource:
             raise ValueError(
                 f"duration_s = {duration_s:g} holds no sample at fs_hz = {self.fs_hz:g}: make it longer"
             )
-        self._fs = Fraction(self.fs_hz)
-        self._n_cells = math.ceil(Fraction(self.n_samples) * CELLS_PER_S / self._fs)
-        while self._first_block(self._n_cells) * BLOCK < self.n_samples:
-            self._n_cells += 1  # the last block has its middle in the next cell
+        self._cells = Cells(self.fs_hz)
+        self._n_cells = self._cells.count(self.n_samples)
         self.jammers = tuple(jammers)
+        self._fused = [j for j in self.jammers if getattr(j, "fused", False)]
+        self._added = [j for j in self.jammers if j not in self._fused]
+        self._tables = _jammer_tables(self._fused)
         seed = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
         self._seed = seed.generate_state(1, np.uint64)[0]
         self._sigma = np.float32(1.0 if noise else 0.0)
@@ -203,12 +233,6 @@ class SyntheticSource:
             return cell
         return self.front_end.push(cell, last=not self._pending and self._next_cell == self._n_cells)
 
-    def _first_block(self, cell: int) -> int:
-        """First block with its middle at or after the beginning of the cell, in exact arithmetic."""
-        num, den = self._fs.as_integer_ratio()
-        unit = CELLS_PER_S * BLOCK * den
-        return max(-((unit - 2 * num * cell) // (2 * unit)), 0)
-
     def _prepare(self, cell: int) -> tuple:
         """All that the kernel needs for one cell; what is slow and what is shared is done here, in order."""
         group, k = divmod(cell, CELLS_PER_S)
@@ -217,14 +241,18 @@ class SyntheticSource:
         _, code, carrier, gain = self._group
         symbols, components = self._symbols(group // _SEGMENT_S)
         periods = np.round(cell * _CELL_CHIPS / components["code_length_chips"]).astype(np.int64)
-        first, last = self._first_block(cell), self._first_block(cell + 1)
-        num, den = self._fs.as_integer_ratio()
-        n_start = (first * BLOCK * CELLS_PER_S * den - num * cell) / (CELLS_PER_S * den)
+        first, last, n_start = self._cells.place(cell)
         job = components, code[k], carrier[k], gain[k], periods
         seen = gain[k].any(axis=1)
         if not seen.all():
             job = tuple(part[seen] for part in job)
-        return first, last, n_start, *job, symbols
+        carriers = [j.carrier(group)[k] for j in self._fused]
+        return first, last, n_start, *job, symbols, np.reshape(carriers, (-1, 4)), self._levels(first, last)
+
+    def _levels(self, first: int, last: int) -> np.ndarray:
+        """Amplitudes of the jammers over the blocks of a cell: float32 (J, 1) or (J, sub-blocks)."""
+        levels = [j.level(first, last) for j in self._fused]
+        return np.stack(np.broadcast_arrays(*levels)) if levels else np.zeros((0, 1), np.float32)
 
     def _polynomials(self, cell: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Code chips (cells, S, 4), carrier cycles, amplitude (cells, S, 2) of the cells of a second.
@@ -284,25 +312,43 @@ class SyntheticSource:
             self._segment = (segment, np.concatenate(parts), components[self._rows])
         return self._segment[1], self._segment[2]
 
-    def _make(self, first, last, n_start, components, code, carrier, gain, periods, symbols) -> np.ndarray:
+    def _make(
+        self, first, last, n_start, components, code, carrier, gain, periods, symbols, jammer_carrier, level
+    ) -> np.ndarray:
         n = (last - first) * BLOCK
-        args = (
-            self._seed, self._sigma, first * BLOCK, n_start, self.fs_hz / CELLS_PER_S,
+        plain = self.spec.bits == 8 and self.complex and not (self._added or self.front_end.streaming)
+        iq, out = np.empty((2, 0 if plain else n), np.float32), np.empty((2, n if plain else 0), np.int8)
+        synthesise(
+            iq, out, self.front_end.gain, self._seed, self._sigma, first * BLOCK, n_start, self._cells.n_cell,
             components, code, carrier, gain, periods, self._codes, symbols,
+            self._tables[0], jammer_carrier, level, *self._tables[1:],
         )  # fmt: skip
-        if self.spec.bits == 8 and not self.jammers and self.complex and not self.front_end.streaming:
-            out = np.empty((2, n), np.int8)
-            synthesise_int8(out, self.front_end.gain, *args)
+        if plain:
             return out
-        iq = np.empty((2, n), np.float32)
-        synthesise(iq, *args)
-        for jammer in self.jammers:
+        for jammer in self._added:
             jammer.add(iq, first * BLOCK)
         if self.front_end.streaming:
             return iq
         if not self.complex:
             iq[1] = 0.0
         return self.front_end(iq)
+
+
+def _jammer_tables(runs) -> tuple[np.ndarray, ...]:
+    """JAMMER rows of the jammers, and the tables into which they point, flat: codes, waves, taps."""
+    rows = np.zeros(len(runs), JAMMER)
+    parts: tuple[list, list, list] = (
+        [np.zeros(0, np.int8)],
+        [np.zeros(0, np.int16)],
+        [np.zeros(0, np.float32)],
+    )
+    for k, run in enumerate(runs):
+        rows[k] = run.row[0]
+        for table, part in zip(parts, (run.envelope.codes, run.envelope.waves, run.envelope.taps)):
+            if len(part):
+                rows[k]["table"] = sum(len(p) for p in table)
+            table.append(part)
+    return rows, *(np.concatenate(p) for p in parts)
 
 
 def hermite_cells(value: np.ndarray, rate: np.ndarray) -> np.ndarray:
