@@ -6,13 +6,12 @@ Doppler. Code and carrier come from one clock, so the code of a satellite with D
 per second; in an inverted recording by minus that.
 """
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sdr import iffile
+from sdr import guess, iffile
 from signals.constants import CYCLES_PER_CHIP
 from signals.modulation import SIGNALS
 from tracking.acquisition import AcquisitionSpec, acquire
@@ -20,33 +19,10 @@ from tracking.acquisition import AcquisitionSpec, acquire
 if TYPE_CHECKING:
     from sdr.__main__ import Recording
 
-COMMON_RATES_HZ = tuple(
-    1e6 * r
-    for r in (
-        2.046,
-        2.048,
-        2.5,
-        2.6,
-        4.0,
-        4.092,
-        4.096,
-        5.0,
-        5.456,
-        6.0,
-        6.625,
-        8.0,
-        8.184,
-        10.0,
-        12.0,
-        12.5,
-        16.0,
-        *(16.3676, 16.368, 20.0, 20.46, 24.0, 25.0, 26.0, 30.0, 38.192, 40.0, 50.0),
-    )
-)
-"""Rates that front ends and published data sets use; tried when none is declared."""
-FORMATS_BY_BYTES = ("ci8", "ci16", "cf32", "ri8", "ri16")
 LOOK_S = 1.0
 SPUR_DB = 10.0
+MUCH_BETTER = 1.5
+"""Another reading must find so many times as much as the declared one to be believed instead."""
 
 
 def probe(path: Path, recording: "Recording", figures: Path | None = None) -> dict[str, Any]:
@@ -56,20 +32,36 @@ def probe(path: Path, recording: "Recording", figures: Path | None = None) -> di
     """
     declared = iffile.declaration(path, recording)
     tried: list[str] = []
-    if declared.format is None:
-        declared = replace(declared, format=_guess_format(path, declared))
-        tried.append(f"format {declared.format} guessed from the bytes")
-    if declared.fs_hz is None:
-        declared, rates_tried = _guess_rate(path, declared)
-        tried.append(f"{rates_tried} sample rates tried")
-    iq, fs_hz = _look(path, declared)
-    stats = statistics(iq)
-    freq_hz, psd_db = spectrum(iq, fs_hz)
-    spurs = find_spurs(freq_hz, psd_db)
-    satellites = _satellites(iq, fs_hz, declared.if_hz or 0.0)
-    inverted, significance = inversion(iq, fs_hz, declared.if_hz or 0.0, satellites)
-    result: dict[str, Any] = stats | {
-        "spurs": spurs,
+    if declared.format is None or declared.fs_hz is None or _needs_if(declared):
+        declared, tried = guess.fit(declared)
+    iq, result = _findings(declared)
+    if result["declaration"]["inverted"] is None:
+        better = _better(declared)
+        if better is not None:
+            tried = [f"not as declared ({_options(declared)}): read otherwise, far more is found"]
+            declared = better
+            iq, result = _findings(declared)
+    result["advice"] = _advice(path, result, declared.conjugate, tried)
+    if figures is not None:
+        result["figures"] = [str(p) for p in _draw(figures, iq, result.pop("psd"), result["spurs"])]
+    result.pop("psd", None)
+    result["text"] = _text(path, result)
+    return result
+
+
+def _findings(declared: "iffile.Declaration") -> tuple[np.ndarray, dict[str, Any]]:
+    """The first second of samples, and all that is said of them; ``psd`` is for the figure alone."""
+    source = iffile.open_recording(declared.data, declared)
+    iq, fs_hz, if_hz = (
+        source.read(min(source.n_samples, int(LOOK_S * source.fs_hz)))[1],
+        source.fs_hz,
+        source.if_hz,
+    )
+    psd = spectrum(iq, fs_hz)
+    satellites = _satellites(iq, fs_hz, if_hz)
+    inverted, significance = inversion(iq, fs_hz, if_hz, satellites)
+    return iq, statistics(iq) | {
+        "spurs": find_spurs(*psd),
         "declaration": {
             "format": declared.format,
             "fs_hz": fs_hz,
@@ -79,12 +71,21 @@ def probe(path: Path, recording: "Recording", figures: Path | None = None) -> di
             "inverted_significance": significance,
         },
         "satellites": satellites,
+        "psd": psd,
     }
-    result["advice"] = _advice(path, result, declared.conjugate, tried)
-    if figures is not None:
-        result["figures"] = [str(p) for p in _draw(figures, iq, freq_hz, psd_db, spurs)]
-    result["text"] = _text(path, result)
-    return result
+
+
+def _needs_if(declared: "iffile.Declaration") -> bool:
+    return declared.if_hz is None and not iffile.sample_format(str(declared.format)).complex
+
+
+def _better(declared: "iffile.Declaration") -> "iffile.Declaration | None":
+    """Another way of reading the file that finds far more satellites; None where there is none."""
+    try:
+        other, _ = guess.fit(guess.undeclared(declared))
+    except ValueError:
+        return None
+    return other if guess.score(other) > MUCH_BETTER * guess.score(declared) else None
 
 
 def statistics(iq: np.ndarray) -> dict[str, Any]:
@@ -188,12 +189,6 @@ def inversion(
     return (slope < 0 if significance >= 4.0 else None), float(significance)
 
 
-def _look(path: Path, declared: "iffile.Declaration") -> tuple[np.ndarray, float]:
-    source = iffile.open_recording(path, declared)
-    n = min(source.n_samples, int(LOOK_S * source.fs_hz))
-    return source.read(n)[1], source.fs_hz
-
-
 def _satellites(iq: np.ndarray, fs_hz: float, if_hz: float) -> list[dict[str, Any]]:
     found: list[dict[str, Any]] = []
     window = iq[:, : int(0.1 * fs_hz)]
@@ -210,61 +205,6 @@ def _satellites(iq: np.ndarray, fs_hz: float, if_hz: float) -> list[dict[str, An
                     }
                 )
     return found
-
-
-def _guess_format(path: Path, declared: "iffile.Declaration") -> str:
-    """The sample format whose values look most like noise through a front end."""
-    with path.open("rb") as f:
-        head = f.read(1 << 20)
-    if len(head) < 4096:
-        raise ValueError(
-            f"'{path}' holds {len(head)} bytes, too few to guess its format; give --format and --fs-hz"
-        )
-    head = head[: len(head) // 8 * 8]
-    with np.errstate(invalid="ignore", over="ignore"):
-        as_float = np.frombuffer(head, "<f4").astype(np.float64)
-        sane = np.isfinite(as_float) & (
-            (as_float == 0) | ((np.abs(as_float) > 1e-9) & (np.abs(as_float) < 1e9))
-        )
-    if sane.mean() > 0.999:
-        return "cf32"
-    low, high = np.frombuffer(head, "u1").reshape(-1, 2).T
-    # In 16-bit noise the low byte is nearly uniform and the high byte nearly constant; 8-bit samples look alike.
-    entropy = [_entropy_bits(b) for b in (low, high)]
-    if entropy[0] - entropy[1] > 1.0:
-        return "ci16"
-    i, q = (b.view("i1").astype(np.float64) for b in (low.copy(), high.copy()))
-    # Neighbours in a real recording at an IF correlate strongly with alternating lags; I against Q hardly does.
-    pair = abs(np.corrcoef(i, q)[0, 1])
-    gap = abs(np.corrcoef(i[1:], q[:-1])[0, 1])
-    return "ri8" if pair > 0.1 and gap > 0.1 else "ci8"
-
-
-def _entropy_bits(values: np.ndarray) -> float:
-    share = np.bincount(values, minlength=256) / values.size
-    share = share[share > 0]
-    return float(-(share * np.log2(share)).sum())
-
-
-def _guess_rate(path: Path, declared: "iffile.Declaration") -> tuple["iffile.Declaration", int]:
-    """Try the usual rates: only at the right one does a satellite's code repeat every millisecond."""
-    best: tuple[float, float] | None = None
-    for fs_hz in sorted(set(COMMON_RATES_HZ)):
-        trial = replace(declared, fs_hz=fs_hz)
-        source = iffile.open_recording(path, trial)
-        iq = source.read(min(source.n_samples, int(0.02 * fs_hz)))[1]
-        if iq.shape[1] < 0.002 * fs_hz:
-            continue
-        rows = acquire(iq, 0, fs_hz, declared.if_hz or 0.0, "L1CA", list(range(1, 33)), AcquisitionSpec())
-        score = float(np.sum(np.where(rows["acquired"], rows["statistic"] / rows["threshold"], 0.0)))
-        if score > 0 and (best is None or score > best[0]):
-            best = (score, fs_hz)
-    if best is None:
-        raise ValueError(
-            f"'{path}': no GPS satellite was found at any of {len(set(COMMON_RATES_HZ))} usual sample rates read as "
-            f"{declared.format}; give --fs-hz (and --format, --if-hz) as the recorder was set"
-        )
-    return replace(declared, fs_hz=best[1]), len(set(COMMON_RATES_HZ))
 
 
 def _advice(path: Path, result: dict[str, Any], conjugated: bool, tried: list[str]) -> str:
@@ -300,6 +240,10 @@ def _advice(path: Path, result: dict[str, Any], conjugated: bool, tried: list[st
     return "; ".join(parts)
 
 
+def _options(declared: "iffile.Declaration") -> str:
+    return f"{declared.format}, {(declared.fs_hz or 0.0) / 1e6:.6g} Msps, IF {(declared.if_hz or 0.0) / 1e6:.6g} MHz"
+
+
 def _text(path: Path, result: dict[str, Any]) -> str:
     d = result["declaration"]
     inverted = {True: "inverted", False: "upright", None: "inversion undecided"}[d["inverted"]]
@@ -326,9 +270,11 @@ def _text(path: Path, result: dict[str, Any]) -> str:
 
 
 def _draw(
-    directory: Path, iq: np.ndarray, freq_hz: np.ndarray, psd_db: np.ndarray, spurs: list[dict[str, float]]
+    directory: Path, iq: np.ndarray, psd: tuple[np.ndarray, np.ndarray], spurs: list[dict[str, float]]
 ) -> list[Path]:
     from sdr.plot import figure
+
+    freq_hz, psd_db = psd
 
     directory.mkdir(parents=True, exist_ok=True)
     with figure(directory / "spectrum.png", "Spectrum") as ax:
