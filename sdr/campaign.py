@@ -282,6 +282,9 @@ def _set(tables: dict[str, Any], path: str, value: Any) -> None:
 class Campaign:
     """A CampaignSpec with its grid laid out: points, and groups of points that share their thresholds."""
 
+    live = False
+    """Whether thresholds are found by a receiver's own monitors (``sdr.recorded``)."""
+
     def __init__(self, spec: CampaignSpec, text: str) -> None:
         self.spec, self.text = spec, text
         self.axes = _axes(spec.grid)
@@ -417,11 +420,21 @@ class Campaign:
         return {m.name: m.detector for m in self.spec.monitor}
 
 
+def empty_trial(monitors: int, point: int, trial: int) -> np.ndarray:
+    """TRIAL rows of one trial with nothing known yet."""
+    rows = np.zeros(monitors, TRIAL)
+    rows["point"], rows["trial"], rows["monitor"] = point, trial, np.arange(monitors)
+    for field in TRIAL.names or ():
+        if TRIAL[field] == np.float64:
+            rows[field] = np.nan
+    return rows
+
+
 def _label(setting: dict[str, Any]) -> str:
     return ", ".join(f"{k} = {v}" for k, v in setting.items())
 
 
-def load(name_or_path: str, overrides: tuple[str, ...] = ()) -> Campaign:
+def load(name_or_path: str, overrides: tuple[str, ...] = ()) -> Any:
     """Read a campaign by built-in name or by path; ValueError with one sentence for anything not valid."""
     from sdr.scenario import _apply
 
@@ -463,13 +476,18 @@ def built_in() -> list[str]:
     return sorted(p.name.removesuffix(".toml") for p in _directory().iterdir() if p.name.endswith(".toml"))
 
 
-def from_table(table: dict[str, Any], origin: str = "campaign") -> Campaign:
-    """Campaign of a parsed table; its text is canonical JSON, so that workers can rebuild it."""
+def from_table(table: dict[str, Any], origin: str = "campaign") -> Any:
+    """Campaign of a parsed table, a RecordedCampaign where it names recordings; its text is canonical JSON, so that
+    workers can rebuild it."""
+    if "recordings" in table:
+        from sdr import recorded
+
+        return recorded.from_table(table, origin)
     spec = validate(CampaignSpec, table, origin)
     return Campaign(spec, json.dumps(spec.model_dump(mode="json", by_alias=True), sort_keys=True))
 
 
 @lru_cache(maxsize=4)
-def from_text(text: str) -> Campaign:
+def from_text(text: str) -> Any:
     """Campaign of the canonical text of another one (``Campaign.text``)."""
     return from_table(json.loads(text))

@@ -30,7 +30,7 @@ def plot(path: Path | str, directory: Path | None = None) -> list[Path]:
             h5[f"campaign/{n}"][:] for n in ("rates", "trials", "thresholds", "advantages")
         )
         axes = json.loads(h5["campaign/points"].attrs["axes"])
-        cn0_dbhz = float(json.loads(h5.attrs["scenario"])["twin"]["cn0_dbhz"])
+        twin = json.loads(h5.attrs["scenario"]).get("twin", {})
     jammed = np.array([a.get("jammer.kind") != "none" for a in axes])
     quiet_trials = trials[~jammed[trials["point"]]]
     rates, trials = rates[jammed[rates["point"]]], trials[jammed[trials["point"]]]
@@ -40,8 +40,8 @@ def plot(path: Path | str, directory: Path | None = None) -> list[Path]:
         _rates(rates, gains, axes, out), _curves(rates, trials, axes, out), _roc(trials, quiet_trials, limits, axes, names, out),
         _first_alarms(trials, axes, names, out), _errors(trials, axes, names, out),
     ]  # fmt: skip
-    if {"jammer.bandwidth_hz", "jammer.offset_hz", "jammer.power_dbw"} <= set(axes[0]):
-        drawn.append(_mask(rates, trials, axes, cn0_dbhz, out))
+    if twin and {"jammer.bandwidth_hz", "jammer.offset_hz", "jammer.power_dbw"} <= set(axes[0]):
+        drawn.append(_mask(rates, trials, axes, float(twin["cn0_dbhz"]), out))
     return [p for p in drawn if p is not None]
 
 

@@ -33,6 +33,8 @@ Z_AGREE = 4.0
 def confirm(name: str, point: int, *, overrides: Sequence[str] = (), quiet: bool = False) -> dict[str, Any]:
     """Compare point ``point`` of a campaign on samples with the twin; the command's JSON object."""
     campaign = load(name, tuple(overrides))
+    if campaign.live:
+        raise ValueError(f"--confirm: '{campaign.spec.name}' counts on samples already")
     if not 0 <= point < len(campaign.points):
         raise ValueError(
             f"--confirm {point}: '{campaign.spec.name}' has points 0 to {len(campaign.points) - 1}"

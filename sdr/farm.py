@@ -558,9 +558,13 @@ def _result(crew: Any, f: futures.Future, out: dict) -> Iterator[tuple[Any, Any]
 # -- the two stages -----------------------------------------------------------------------------------------------
 
 
-def _thresholds(campaign: Campaign, results: Results, crew: Any, quiet: bool) -> None:
+def _thresholds(campaign: Any, results: Results, crew: Any, quiet: bool) -> None:
     """Thresholds of every group that has none yet."""
     missing = [g for g in range(len(campaign.quiet)) if g not in results.thresholds["group"]]
+    if campaign.live:
+        for _ in missing:
+            results.keep_thresholds(campaign.live_thresholds())
+        return
     if all(m.threshold is not None for m in campaign.spec.monitor):
         for g in missing:
             results.keep_thresholds(fit_thresholds(campaign, g, []))

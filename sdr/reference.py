@@ -255,7 +255,7 @@ def results_lines() -> Iterator[str]:
     import sdr.findings
     import sdr.modes
     import sdr.respond
-    import sdr.watch
+    import sdr.watch_post
     import signals.records
     import tracking.mitigation
     import tracking.records
@@ -273,8 +273,8 @@ def results_lines() -> Iterator[str]:
         ("truth/jammers", s, "JAMMER_TRUTH"),
         ("truth/echoes", s, "ECHO_TRUTH"),
         ("truth/faults", s, "FAULT_TRUTH"),
-        ("monitors/<name>", sdr.watch, "MONITOR"),
-        ("monitors/thresholds", sdr.watch, "WATCHED"),
+        ("monitors/<name>", sdr.watch_post, "MONITOR"),
+        ("monitors/thresholds", sdr.watch_post, "WATCHED"),
         ("monitors/alarms", monitors.records, "ALARM"),
         ("monitors/<integrity monitor>", sdr.findings, "INTEGRITY"),
         ("monitors/protection", sdr.findings, "PROTECTION"),
@@ -295,7 +295,8 @@ def results_lines() -> Iterator[str]:
 def scenario_page() -> Iterator[str]:
     """Scenario files, then campaign files."""
     from sdr.campaign import CampaignSpec
-    from sdr.scenario import Scenario
+    from sdr.recorded import RecordedSpec
+    from sdr.scenario import ReceiverSpec, Scenario
 
     yield "## Scenario files"
     yield ""
@@ -303,6 +304,9 @@ def scenario_page() -> Iterator[str]:
     yield "## Campaign files"
     yield ""
     yield from scenario_lines(CampaignSpec)
+    yield "## Campaign files over recordings"
+    yield ""
+    yield from scenario_lines(RecordedSpec, seen={ReceiverSpec: "`[receiver]` of a scenario"})
 
 
 PAGES = {"scenario.md": scenario_page, "results.md": results_lines}

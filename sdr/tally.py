@@ -166,8 +166,8 @@ def _summary_row(
         "method": spec.method.kind if c.estimated else "count",
         "k": r.k, "n": r.n, "rate": _number(r.p), "ci_low": r.low, "ci_high": r.high,
         "n_effective": _number(r.n_effective), "trials": c.done, "stop_reason": c.reason,
-        "threshold": float(limit["threshold"]), "threshold_low": float(limit["low"]),
-        "threshold_high": float(limit["high"]), "rule": limit["rule"].decode(), "p_fa": float(limit["p_fa"]),
+        "threshold": _number(limit["threshold"]), "threshold_low": _number(limit["low"]),
+        "threshold_high": _number(limit["high"]), "rule": limit["rule"].decode(), "p_fa": float(limit["p_fa"]),
     }  # fmt: skip
     for other in _COUNTED.values():
         row[f"{other}_k"] = int(rows[f"{other}_missed"].sum())
@@ -177,7 +177,7 @@ def _summary_row(
     row["curve_k"] = rows["curve_missed"].sum(axis=0).tolist()
     row["curve_n"] = rows["curve_n"].sum(axis=0).tolist()
     row |= _roc(rows, limit, c.jammed) | _first_alarm(rows, c.jammed)
-    if not c.jammed:
+    if not c.jammed and not campaign.live:
         row |= _approach(rows, campaign, c.index)
     for field in _ERRORS:
         row[field] = _number(np.max(rows[field]))

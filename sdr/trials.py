@@ -21,10 +21,10 @@ from sdr.campaign import (
     CURVE_BINS,
     ROC_P_FA,
     THRESHOLD,
-    TRIAL,
     Campaign,
     CampaignSpec,
     MonitorSpec,
+    empty_trial,
     from_text,
 )
 from sdr.watch import one_blas_thread
@@ -134,6 +134,8 @@ def _effective(series: list[np.ndarray], n: float) -> float:
 def evaluate_trials(text: str, point: int, first: int, count: int, limits: np.ndarray) -> np.ndarray:
     """TRIAL rows (count x monitors) of the evaluation set; ``limits``: THRESHOLD rows of the point's group."""
     campaign = from_text(text)
+    if campaign.live:
+        return _received(campaign, point, range(first, first + count))
     one = _open_trial if campaign.spec.loop == "open" else _closed_trial
     if campaign.points[point].jammers:
         one = {"splitting": _splitting_trial, "importance": _importance_trial}.get(
@@ -145,10 +147,20 @@ def evaluate_trials(text: str, point: int, first: int, count: int, limits: np.nd
     return np.concatenate(parts)
 
 
+def _received(campaign: Any, point: int, numbers: range) -> np.ndarray:
+    from sdr import recorded
+
+    seeds = [trial_seed(campaign.spec.seeds.evaluation, point, n) for n in numbers]
+    return np.concatenate([recorded.trial(campaign, point, n, s) for n, s in zip(numbers, seeds)])
+
+
 def warm_up(text: str, point: int) -> None:
     """Train what a point needs, in this process."""
+    campaign = from_text(text)
+    if campaign.live:
+        return
     with one_blas_thread():
-        trained(text, from_text(text).group[point])
+        trained(text, campaign.group[point])
 
 
 class _World:
@@ -188,22 +200,12 @@ def _closed_trial(campaign: Campaign, runs: dict, point: int, trial: int, limits
     smoothed = np.empty(len(code_m))
     n_smooth = max(1, round(spec.trial.smooth_s / twin.integration_s))
     hatch_smooth(code_m, epochs["phase_error_cycles"] * WAVELENGTH_M, n_smooth, n_smooth, smoothed)
-    rows = _empty(len(runs), point, trial)
+    rows = empty_trial(len(runs), point, trial)
     rows["cn0_dbhz"], rows["lost"] = _carrier_health(epochs, twin.integration_s, spec.dumps)
     for i, (row, name) in enumerate(zip(rows, runs)):
         s = runs[name].fresh()(summed)
         _count(row, s["value"], limits[i], s["epoch"], span(runs[name]), world, spec)
         _count_errors(row, s["value"] >= limits["threshold"][i], s["epoch"], code_m, smoothed, world, spec)
-    return rows
-
-
-def _empty(monitors: int, point: int, trial: int) -> np.ndarray:
-    """TRIAL rows of one trial with nothing known yet."""
-    rows = np.zeros(monitors, TRIAL)
-    rows["point"], rows["trial"], rows["monitor"] = point, trial, np.arange(monitors)
-    for field in TRIAL.names or ():
-        if TRIAL[field] == np.float64:
-            rows[field] = np.nan
     return rows
 
 
@@ -222,7 +224,7 @@ def _open_trial(campaign: Campaign, runs: dict, point: int, trial: int, limits: 
     seed = trial_seed(spec.seeds.evaluation, point, trial)
     n = campaign.length(point).epochs
     world = _World(twin, (np.arange(n) + 0.5) * twin.integration_s)
-    rows = _empty(len(runs), point, trial)
+    rows = empty_trial(len(runs), point, trial)
     fast = spec.dumps == 1 and all(_by_blocks(run) for run in runs.values())
     series = _by_block_values(twin, seed, runs, n) if fast else None
     corr = None if fast else sum_dumps(twin.start_open(seed)(n), spec.dumps)
@@ -242,7 +244,7 @@ def _importance_trial(
     """One repetition of importance sampling for each monitor."""
     twin, method = campaign.points[point], _method(campaign, Importance)
     seed = trial_seed(campaign.spec.seeds.evaluation, point, trial)
-    rows = _empty(len(runs), point, trial)
+    rows = empty_trial(len(runs), point, trial)
     for row, limit, run in zip(rows, limits, runs.values()):
         row["estimate"] = importance_miss_rate(
             run, cw_taps(twin, twin.jammers[0]), limit["threshold"], method.draws, seed
@@ -255,7 +257,7 @@ def _splitting_trial(
 ) -> np.ndarray:
     """One repetition of splitting for each monitor; what no monitor changes is done once."""
     spec, twin = campaign.spec, campaign.points[point]
-    rows = _empty(len(runs), point, trial)
+    rows = empty_trial(len(runs), point, trial)
     for i, row in enumerate(rows):
         if i and spec.stop.definition == "excess":
             row["estimate"] = rows["estimate"][0]

@@ -224,9 +224,7 @@ class Twin(_Spec):
         """R(d) after the front-end filter: correlation of the signal, and covariance of the noise, over the
         taps.
         """
-        return filtered_autocorrelation(
-            self.signal, self.prn, delay_chips, self.waveform, self.bandwidth_hz
-        )
+        return filtered_autocorrelation(self.signal, self.prn, delay_chips, self.waveform, self.bandwidth_hz)
 
     @property
     def tap_array_chips(self):

@@ -322,10 +322,12 @@ def advantage_rows(bench: _Bench) -> list[dict]:
             f"CW power at which P_MD is 0.01, {a['monitor']}, dBW",
             "|df| T < 0.443; bootstrap over trials",
         )
-        rows.append(row(item, None, a["power_db"], *a["power_ci_db"], note=note))
+        low, high = a["power_ci_db"]
+        rows.append(row(item, None, a["power_db"], low, high, note=note))
         if a["monitor"] != a["against"]:
             item = f"dB that {a['monitor']} needs less than {a['against']} at P_MD 0.01"
-            rows.append(row(item, None, a["gain_db"], *a["gain_ci_db"], note="same trials, same P_FA"))
+            low, high = a["gain_ci_db"]
+            rows.append(row(item, None, a["gain_db"], low, high, note="same trials, same P_FA"))
     return rows
 
 
