@@ -46,6 +46,7 @@ def figure(
 def plot(results: Path, directory: Path | None = None) -> list[Path]:
     """Draw every figure that ``results`` has data for; returns their paths."""
     from sdr.integrity_figures import integrity, stanford
+    from sdr.watch_figures import alarms, monitors
 
     directory = directory or Path(results).with_suffix("")
     with store.read(results) as h5:
@@ -66,7 +67,8 @@ def plot(results: Path, directory: Path | None = None) -> list[Path]:
             _spectrum,
             _attack,
             _attacked_peak,
-            _monitors,
+            monitors,
+            alarms,
             integrity,
             stanford,
         ):
@@ -274,7 +276,7 @@ def _position(h5: h5py.File, channels: dict[str, h5py.Group], directory: Path) -
     return path
 
 
-def _attacks(h5: h5py.File) -> list[tuple[float, float]]:
+def attacks(h5: h5py.File) -> list[tuple[float, float]]:
     """Times (begin, end) in s during which any jammer is on."""
     if "truth/jammers" not in h5:
         return []
@@ -296,7 +298,7 @@ def _spectrum(h5: h5py.File, channels: dict[str, h5py.Group], directory: Path) -
     rows, attrs = data[:], data.attrs
     freq_mhz = ((np.arange(rows.shape[1]) / rows.shape[1] - 0.5) * attrs["fs_hz"] - attrs["if_hz"]) * 1e-6
     t_s = np.arange(len(rows)) * attrs["every_s"]
-    on = np.any([(t_s >= a) & (t_s < b) for a, b in _attacks(h5)] or [np.zeros(len(t_s), bool)], axis=0)
+    on = np.any([(t_s >= a) & (t_s < b) for a, b in attacks(h5)] or [np.zeros(len(t_s), bool)], axis=0)
     path = directory / "spectrum.png"
     with figure(path, "Spectrum of the samples", rows=2, size=(9, 8)) as (ax, fall):
         for mask, label in ((~on, "without jammer"), (on, "with jammer")):
@@ -315,7 +317,7 @@ def _spectrum(h5: h5py.File, channels: dict[str, h5py.Group], directory: Path) -
 
 def _attack(h5: h5py.File, channels: dict[str, h5py.Group], directory: Path) -> Path | None:
     """C/N0, code and carrier errors, the attack shaded."""
-    spans = _attacks(h5)
+    spans = attacks(h5)
     if not spans or not channels:
         return None
     path = directory / "attack.png"
@@ -345,7 +347,7 @@ def _attack(h5: h5py.File, channels: dict[str, h5py.Group], directory: Path) -> 
 
 def _attacked_peak(h5: h5py.File, channels: dict[str, h5py.Group], directory: Path) -> Path | None:
     """Correlation function of the satellite that is hit hardest, before and during the attack."""
-    spans = _attacks(h5)
+    spans = attacks(h5)
     hit = [g for g in channels.values() if "corr" in g and g["corr"].shape[1] >= 3 and len(g["epochs"]) > 100]
     if not spans or not hit:
         return None
@@ -382,48 +384,3 @@ def _attacked_peak(h5: h5py.File, channels: dict[str, h5py.Group], directory: Pa
         ax.set(xlabel="tap offset (chip, early positive)", ylabel="amplitude (ADC levels)")
         ax.legend(fontsize=8)
     return path
-
-
-def _monitors(h5: h5py.File, channels: dict[str, h5py.Group], directory: Path) -> Path | None:
-    """Each live monitor's statistic over its threshold with its alarms, the jammers' truth, and the code error."""
-    if "monitors/thresholds" not in h5:
-        return None
-    limits = h5["monitors/thresholds"][:]
-    names = [n for n in dict.fromkeys(r["monitor"].decode() for r in limits) if n in h5["monitors"]]
-    path = directory / "monitors.png"
-    with figure(
-        path, "Monitors: statistic over threshold", rows=len(names) + 1, size=(9, 2 * len(names) + 2)
-    ) as axes:
-        for ax, name in zip(axes, names):
-            rows = h5[f"monitors/{name}"][:]
-            for limit in limits[limits["monitor"] == name.encode()]:
-                mine = rows[(rows["signal"] == limit["signal"]) & (rows["prn"] == limit["prn"])]
-                label = f"{limit['signal'].decode()} {limit['prn']}"
-                ax.plot(mine["t_s"], mine["value"] / limit["threshold"], lw=0.6, label=label)
-            ax.axhline(1.0, color="k", lw=0.8)
-            ax.set_ylabel(name)
-        if "monitors/alarms" in h5:
-            for alarm in h5["monitors/alarms"][:]:
-                if alarm["monitor"].decode() in names:
-                    ax = axes[names.index(alarm["monitor"].decode())]
-                    ax.axvspan(alarm["start_s"], alarm["end_s"], color="r", alpha=0.1)
-        _code_errors(h5, channels, axes[-1])
-        if "truth/jammers" in h5:
-            truth = h5["truth/jammers"][:]
-            for ax in axes:
-                for t_s in truth["t_s"][1:][np.diff(truth["on"].astype(int)) != 0]:
-                    ax.axvline(t_s, color="r", ls="--", lw=0.8)
-        axes[0].legend(ncol=8, fontsize=6)
-        axes[-1].set_xlabel("time (s); dashed: a jammer starts or ends, shaded: alarm")
-    return path
-
-
-def _code_errors(h5: h5py.File, channels: dict[str, h5py.Group], ax: Any) -> None:
-    for group in channels.values():
-        attrs = group["epochs"].attrs
-        truth = satellite_truth(h5, b"G" if attrs["signal"] == "L1CA" else b"E", attrs["prn"])
-        if len(truth) > 1:
-            errors = tracking_errors(group["epochs"][:], truth, attrs["fs_hz"], attrs["signal"])
-            late = errors["t_s"] > errors["t_s"][0] + 5.0 if len(errors["t_s"]) else slice(None)
-            ax.plot(errors["t_s"][late], errors["code_m"][late], lw=0.5)
-    ax.set_ylabel("code error (m)")

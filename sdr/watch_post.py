@@ -39,6 +39,10 @@ UNWATCHED = np.dtype(
 """A time without tests after the training: the channel had no lock."""
 
 
+FAILING_S = 3.0
+"""A channel that is lost has been failing for up to so long: an alarm in that time is held."""
+
+
 class Post:
     """A trained test on one stream of epochs.
 
@@ -142,7 +146,7 @@ class Post:
     def _held(self, rows: np.ndarray) -> np.ndarray:
         """Alarms that stood at the begin of a break last until its end, and join the next that begins there."""
         for start_s, end_s in self._breaks:
-            stood = (rows["start_s"] <= start_s) & (rows["end_s"] >= start_s - self._gap_s)
+            stood = (rows["start_s"] <= start_s) & (rows["end_s"] >= start_s - max(FAILING_S, self._gap_s))
             rows["end_s"][stood] = np.maximum(rows["end_s"][stood], end_s)
         joined = [rows[:1]]
         for k in range(1, len(rows)):
@@ -189,7 +193,7 @@ class Post:
         quiet = int(np.count_nonzero(t_s < quiet_until_s))
         false, approach = (
             sum(float(a["start_s"]) < quiet_until_s for a in self._alarms(limit))
-            for limit in (self.threshold, max(self.threshold, self.approach_threshold))
+            for limit in (self.threshold, max(self.threshold, self.approach_threshold or 0.0))
         )
         return head | {
             "threshold": self.threshold,
@@ -281,10 +285,10 @@ def _events(row: dict[str, Any]) -> list[str]:
     alarms = row.get("alarms", [])
     out = []
     if alarms:
-        peak = max(a["peak"] for a in alarms) / row["threshold"]
+        peak = max(a["peak"] for a in alarms)
         out.append(
-            f"alarm from {alarms[0]['start_s']:.1f} s, {len(alarms)} to {alarms[-1]['end_s']:.1f} s, up to {peak:.1f} times "
-            "the threshold"
+            f"{len(alarms)} alarms from {alarms[0]['start_s']:.1f} to {alarms[-1]['end_s']:.1f} s, up to {peak:.4g} "
+            f"(threshold {row['threshold']:.4g})"
         )
     for gap in row.get("unwatched", ()):
         held = "an alarm stood and is held" if gap["alarm"] else "no alarm stood"
