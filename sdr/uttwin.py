@@ -145,6 +145,8 @@ class Trial:
     barometer: BarometerSpec | None = None
     clock_s_f: float = 0.009
     clock_s_g: float = 0.035
+    aided: bool = False
+    """Scalar loops are told the change of the range rate by inertial navigation (17 states, not corrected)."""
     fll_hz: float = 4.0
     dll_hz: float = 1.0
 
@@ -173,7 +175,7 @@ def run(
         gains = np.array([math.sqrt(2.0) * wn, wn * wn, 4 * bt / (1 + 2 * bt)])
         scalar_run(
             noise, sky.pos[0].copy(), T_S, half, sky.sat_pos, sky.sat_vel, sky.rho, sky.rate, sky.pos, sky.vel, bias, drift,
-            cn0, jam, q_rc, amplitude, gains, 10**2.2, 1.0, guarded, sky.r_le, EVERY, watch, out,
+            cn0, jam, q_rc, amplitude, _aid(sky, trial, children[3], children[4], children[5]), gains, 10**2.2, 1.0, guarded, sky.r_le, EVERY, watch, out,
         )  # fmt: skip
         return out
     model = build_model(spec, trial.imu, trial.odometer, trial.barometer)
@@ -216,6 +218,29 @@ def _sensors(sky, trial, imu_seed, odometer_seed, barometer_seed):
         height[np.searchsorted(imu["t_s"], rows["t_s"] - 1e-6)] = rows["height_m"]
     columns = imu["gyro_rad_s"], imu["accel_mps2"], odometer["speed_mps"], height
     return np.column_stack(columns), round(per_epoch)
+
+
+def _aid(sky, trial, *seeds):
+    """Change of the range rates (E, C) over each epoch by free inertial navigation from the true state; zeros without."""
+    aid = np.zeros(sky.rho.shape)
+    if not trial.aided:
+        return aid
+    model = build_model(SteeringSpec(mode="ultra_tight", model="ecef17"), trial.imu)
+    sensors, m = _sensors(sky, trial, *seeds)
+    x = nominal_of(model, sky.pos[0], sky.vel[0], 0.0, 0.0)
+    n = model.n + 1
+    p, f, phi, qd = (np.zeros((n, n)) for _ in range(4))
+    shape = sky.rho.shape[1]
+    rho, los = np.empty(shape), np.empty((shape, 3))
+    rate = np.empty((sky.n_epochs + 1, shape))
+    for e in range(sky.n_epochs + 1):
+        predict_ranges(sky.sat_pos[e], sky.sat_vel[e], x[0:3], x[3:6], rho, rate[e], los)
+        if e < sky.n_epochs:
+            ut.predict(
+                model_code(model), x, p, sensors[e * m : (e + 1) * m], T_S / m, 1.0, model_rates(model),
+                extended_q(model, x), f, phi, qd,
+            )  # fmt: skip
+    return np.diff(rate, axis=0)
 
 
 def _start(sky, trial, model, rng, bias_m, drift_mps):

@@ -220,9 +220,10 @@ def aided_run(rng, model, x, p, sensors, per_epoch, dt_s, filter_s, rates, q_dia
 
 @njit(cache=True, nogil=True)
 def scalar_run(rng, pos0, T, half_space, sat_pos, sat_vel, rho_true, rate_true, pos_true, vel_true, bias, drift, cn0_hz,
-               jam, q_rc, amplitude, gains, min_cn0_hz, lost_s, guarded, r_le, every, watch, out):  # fmt: skip
+               jam, q_rc, amplitude, aid, gains, min_cn0_hz, lost_s, guarded, r_le, every, watch, out):  # fmt: skip
     """One trial of independent channels: second-order FLL (gains[0], gains[1]), carrier-aided DLL (gains[2]), then LS.
 
+    ``aid`` (E, C): change of each range rate over the epoch as inertial sensors have it, m/s; zeros: loops of their own.
     A channel is dropped when its C/N0 (1 s) stays below ``min_cn0_hz`` for ``lost_s``; with ``guarded`` it leaves the
     solution for ever (no acquisition here), else all channels are used always, as a receiver without detectors would.
     """
@@ -233,7 +234,7 @@ def scalar_run(rng, pos0, T, half_space, sat_pos, sat_vel, rho_true, rate_true, 
     meas, truth = np.zeros((count, 4)), np.zeros((count, 2))
     state, cov, residual, los = np.zeros(5), np.zeros((5, 5)), np.zeros(count), np.zeros((count, 3))
     use, second, var = np.ones(count, np.uint8), np.zeros(count), np.ones(count)
-    vel, clock = np.zeros(3), np.zeros(1)
+    vel, clock, rate_now = np.zeros(3), np.zeros(1), np.zeros(count)
     for c in range(count):
         rho_nco[c], rate_nco[c] = rho_true[0, c] + bias[1], rate_true[0, c] + drift[1]
     state[:3] = pos0
@@ -249,7 +250,7 @@ def scalar_run(rng, pos0, T, half_space, sat_pos, sat_vel, rho_true, rate_true, 
             lost[c] = lost[c] or bad_s[c] > lost_s
             err = -WAVELENGTH_M * meas[c, 1]
             ramp[c] += gains[1] * err / T
-            step = ramp[c] * T + gains[0] * err
+            step = ramp[c] * T + gains[0] * err + aid[e, c]
             rho_nco[c] += rate_nco[c] * T + 0.5 * step * T - gains[2] * METRES_PER_CHIP * meas[c, 0]
             rate_nco[c] += step
         if (e + 1) % every == 0:
@@ -263,10 +264,12 @@ def scalar_run(rng, pos0, T, half_space, sat_pos, sat_vel, rho_true, rate_true, 
             o[10] = left
             if left < 4:
                 continue
-            # NCO ranges hold at the middle of the next epoch: take them back by half of one.
+            # NCO states hold at the middle of the next epoch: take them back by half of one.
+            for c in range(count):
+                rate_now[c] = rate_nco[c] - 0.5 * (ramp[c] * T + aid[e, c])
             ok, _ = solve_position(
                 sat_pos[e + 1],
-                rho_nco - 0.5 * T * rate_nco,
+                rho_nco - 0.5 * T * rate_now,
                 var,
                 second,
                 use,
@@ -284,7 +287,7 @@ def scalar_run(rng, pos0, T, half_space, sat_pos, sat_vel, rho_true, rate_true, 
             solve_velocity(
                 sat_pos[e + 1],
                 sat_vel[e + 1],
-                rate_nco,
+                rate_now,
                 var,
                 use,
                 state[:3].copy(),
