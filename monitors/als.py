@@ -21,7 +21,7 @@ from typing import Literal
 
 import numpy as np
 from numba import njit
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from nav.eskf import EpochLog, Eskf
 
@@ -390,6 +390,14 @@ class Als(BaseModel):
     """Estimate the scale of the process noise too."""
     retune_p: bool = True
     """Restart the filter's covariance when R is retuned."""
+
+    @model_validator(mode="after")
+    def _fits(self):
+        if self.window_epochs <= self.n_lags:
+            raise ValueError(
+                f"window_epochs = {self.window_epochs} are shorter than the {self.n_lags} lags: lengthen the window or lower n_lags"
+            )
+        return self
 
     def start(self, rows: np.ndarray | None = None) -> "AlsRun":
         """Start on the measurement rows whose noise is to be estimated (range, rate, or both; default all used)."""

@@ -22,7 +22,7 @@ from typing import Literal
 
 import numpy as np
 from numba import njit
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from monitors.noise_rmd import tuned_variance
 from nav.errormodels import FOOT_M
@@ -320,20 +320,24 @@ class ParallelFilters(BaseModel):
     recertify_growth: float = Field(1.5, ge=1)
     """How much the sensitivity factor may have grown since the exclusion."""
 
-    def layout(self, m: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """(use, test, period, phase) of the filters for m satellite slots, filter 0 = navigation."""
-        if self.scheme == "sets_of_four":
-            return _sets_layout(m)
-        if self.staggered > 1 and self.period_epochs % self.staggered:
+    @model_validator(mode="after")
+    def _fits(self):
+        if self.scheme == "leave_one_out" and self.period_epochs % self.staggered:
             raise ValueError(
                 f"period_epochs ({self.period_epochs}) must be a multiple of the {self.staggered} staggered filters."
             )
         if self.short_window_epochs > self.window_epochs:
             raise ValueError("short_window_epochs must not exceed window_epochs.")
-        if self.window_epochs > self.period_epochs:
+        if self.scheme == "leave_one_out" and self.window_epochs > self.period_epochs:
             raise ValueError(
                 "window_epochs must not exceed period_epochs: the sums are dropped at every reset."
             )
+        return self
+
+    def layout(self, m: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """(use, test, period, phase) of the filters for m satellite slots, filter 0 = navigation."""
+        if self.scheme == "sets_of_four":
+            return _sets_layout(m)
         if m < 2:
             raise ValueError(f"The parallel filters need at least 2 satellites besides other aids, not {m}.")
         count = 1 + m * self.staggered
@@ -460,33 +464,43 @@ class ParallelBank:
 
 
 class PacedBank:
-    """A ParallelBank on every n-th epoch of a filter that corrects its own trajectory in between.
+    """A ParallelBank on every n-th epoch of a filter that corrects its own trajectory in between, on the mean of the ranges.
 
     The bank's states are relative to the trajectory as it was at its last epoch; what the filter has corrected since then
-    is carried along: m <- phi m + dx, z = r + H m.
+    is carried along, m <- phi m + dx. Each satellite's mean of z = r + H m over its n epochs has the noise R / n (white
+    ranges) and stands for the last of them: the prediction error hardly changes within a second.
     """
 
     def __init__(self, spec: ParallelFilters, m: int, p0: np.ndarray, every: int = 1):
         self.bank, self.every = spec.start(m, p0), every
-        self._r0 = spec.r0_m2
-        n = p0.shape[0]
-        self._phi, self._qd, self._moved = np.eye(n), np.zeros((n, n)), np.zeros(n)
-        self._epoch = 0
+        self._r0, self._shape = spec.r0_m2, (m, p0.shape[0])
+        self._moved, self._epoch = np.zeros(p0.shape[0]), 0
+        self._open()
+
+    def _open(self) -> None:
+        m, n = self._shape
+        self._phi, self._qd, self._h = np.eye(n), np.zeros((n, n)), np.zeros((m, n))
+        self._sum, self._var, self._n = np.zeros(m), np.zeros(m), np.zeros(m)
 
     def __call__(self, phi, qd, h, r, var, avail, dx, aids=None) -> BankReport | None:
         """One epoch of the filter: ``r`` (m,) innovations that its correction ``dx`` (n,) followed; ``aids`` (h, r, var)."""
         chain(self._phi, self._qd, phi, qd)
         self._moved = phi @ self._moved
+        self._h[avail] = h[avail]
+        self._sum += np.where(avail, r + h @ self._moved, 0.0)
+        self._var += np.where(avail, var, 0.0)
+        self._n += avail
         self._epoch += 1
         if self._epoch % self.every:
             self._moved += dx
             return None
         extra = (None, None, None) if aids is None else (aids[0], aids[1] + aids[0] @ self._moved, aids[2])
-        z, safe = r + h @ self._moved, np.where(avail, var + self._r0, 1.0)
-        report = self.bank(self._phi, self._qd, h, z, safe, avail, *extra)
+        n, there = np.maximum(self._n, 1.0), self._n > 0
+        mean_var = np.where(there, self._var / n**2 + self._r0, 1.0)
+        report = self.bank(self._phi, self._qd, self._h, self._sum / n, mean_var, there, *extra)
         self.bank.shift(self._moved + dx)
         self._moved = np.zeros_like(self._moved)
-        self._phi, self._qd = np.eye(dx.size), np.zeros((dx.size, dx.size))
+        self._open()
         return report
 
     def moved(self, dx: np.ndarray) -> None:

@@ -335,3 +335,29 @@ def test_a_weakened_satellite_counts_less_and_a_factor_below_one_changes_no_bit(
     moved = np.linalg.norm(fix(bad) - fix(observed))
     rows["weaken"] = 1e6
     assert np.linalg.norm(fix(bad, Remedy(rows)) - fix(observed, Remedy(rows))) < 0.01 * moved
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["receiver.integrity.bias_bank.grid_m=[5, 10]"], ["bias_bank", "contain 0 (no bias)"]),
+        (["receiver.integrity.bias_bank.grid_m=[0, 5, 5]"], ["no value twice"]),
+        (["receiver.integrity.als.window_epochs=20", "receiver.integrity.als.n_lags=20"], ["20 lags"]),
+        (["receiver.integrity.parallel_filters.r0_m2=-1"], ["r0_m2", "greater than or equal to 0"]),
+        (["receiver.integrity.parallel_filters.period_epochs=17"], ["multiple of the 3"]),
+        (["receiver.integrity.noise_rmd.r0_m2=-1"], ["r0_m2"]),
+        (["receiver.steering.code_noise_m=0"], ["code_noise_m", "greater than 0"]),
+        (["receiver.navigation={kind='least_squares'}"], ["smoothing_s = 0"]),
+        (["receiver.integrity={}"], ["receiver.respond", "add [receiver.integrity."]),
+    ],
+)
+def test_bad_settings_are_one_sentence_on_the_command_line(overrides, words, capsys, monkeypatch):
+    """Exit code 2, one line that says what is wrong, where, and what is allowed."""
+    from sdr.__main__ import main
+
+    arguments = [part for item in overrides for part in ("--set", item)]
+    monkeypatch.setattr("sys.argv", ["gnssbb", "run", "integrity-ut-ramp", *arguments])
+    with pytest.raises(SystemExit) as end:
+        main()
+    said = capsys.readouterr().err.strip()
+    assert end.value.code == 2 and "\n" not in said and all(w in said for w in words), said
