@@ -110,7 +110,7 @@ class Store:
                     h5.attrs[key] = value
                 h5.attrs["complete"] = complete
                 for name, blocks in self._pending.items():
-                    _extend(h5, name, np.concatenate(blocks))
+                    _extend(h5, name, _joined(blocks))
                 for name, attrs in self._attrs.items():
                     if name in h5:
                         h5[name].attrs.update(attrs)
@@ -128,6 +128,14 @@ class Store:
 
 def _reason(err: OSError) -> str:
     return os.strerror(err.errno).lower() if err.errno else (str(err).splitlines() or ["unknown reason"])[0]
+
+
+def _joined(blocks: list[np.ndarray]) -> np.ndarray:
+    """All rows; records as opaque bytes, for numpy would compare their fields block by block."""
+    kind = blocks[0].dtype
+    if kind.names is None:
+        return np.concatenate(blocks)
+    return np.concatenate([b.view(f"V{kind.itemsize}") for b in blocks]).view(kind)
 
 
 def _extend(h5: h5py.File, name: str, rows: np.ndarray) -> None:
