@@ -458,7 +458,7 @@ def _split_words(words, bits, sign, out, at):
 @njit(cache=True, nogil=True)
 def _split_float32(raw, is_complex, sign, out, at, n):
     """Returns the first sample that is not finite, or -1."""
-    a, two, one, turn, odd = np.uint64(at), np.uint64(2), np.uint64(1), np.float32(sign), 0
+    a, two, one, turn, odd = np.uint64(at), np.uint64(2), np.uint64(1), np.float32(sign), np.int32(0)
     if is_complex:
         for k in range(np.uint64(n)):
             out[0, a + k] = raw[two * k]

@@ -462,7 +462,9 @@ class Tracker:
                     self.symbols, self.symbol_counts,
                 )  # fmt: skip
 
-        self._share(run, self._running())
+        active = self._running()
+        if len(active):
+            self._share(run, active)
         self._keep(tail[:, :n_left], iq)
         return epochs, counts, corr
 
@@ -499,7 +501,8 @@ class Tracker:
     def _share(self, run, active):
         """Run the channels, each on one thread."""
         n = min(self.spec.threads, len(active))
-        if n == 0:
+        if self._threads is None or n < 2:
+            run(active)
             return
         others = [self._threads.submit(run, active[t::n]) for t in range(1, n)]
         run(active[::n])

@@ -19,7 +19,7 @@ import numpy as np
 from numba import njit
 
 from signals.constants import CHIP_RATE_HZ, F_L1_HZ
-from tracking.correlator import carrier_table, correlate_period, scratch
+from tracking.correlator_kernels import carrier_table, correlate_period, scratch
 from tracking.discriminators import (
     COHERENT,
     FOUR_QUADRANT,
