@@ -261,6 +261,7 @@ class Receiver:
     def _navigate(self, sample: int, out: Outcome) -> None:
         if self.drift.inverted:
             return
+        self._drop_images(sample)
         rows = self.transmit(sample)
         solution = self.navigator.update(
             rows, self.telemetry.ephemerides(), self.telemetry.iono_utc("G"), self.telemetry.iono_utc("E"),
@@ -276,6 +277,22 @@ class Receiver:
         if self.integrity is not None:
             # What it asks for holds from the next epoch on: the hand-over to navigation, one epoch later.
             out.integrity.append(self.integrity(sample))
+
+    def _drop_images(self, sample: int) -> None:
+        """Give up channels that follow a stronger satellite through its code's cross-correlation with theirs."""
+        for group in self.telemetry.shared_orbits():
+            cn0 = self.tracker.snapshot(sample)["cn0_dbhz"]
+            tracked = {
+                prn: self.channel_of["L1CA", prn] for _, prn in group if ("L1CA", prn) in self.channel_of
+            }
+            own = max(tracked, key=lambda prn: cn0[tracked[prn]], default=None)
+            for _, prn in group if own is not None else ():
+                if prn == own:
+                    continue
+                self.telemetry.forget("G", prn)
+                if prn in tracked:
+                    self.tracker.release(tracked[prn])
+                    del self.channel_of["L1CA", prn]
 
     def _remedy(self, sample: int) -> Remedy | None:
         """What the monitors ask of the epoch that ends at ``sample``; None unless ``[receiver.respond]`` wants it."""

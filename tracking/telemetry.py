@@ -9,6 +9,7 @@ from tracking.lock import STATE_LOCKED
 
 __all__ = ["Telemetry"]
 
+_ORBIT = ("week", "toe_s", "sqrt_a_sqrt_m", "e", "m0_rad", "omega0_rad", "i0_rad", "af0_s")
 _GAP = 1000  # symbols: a restarted channel must not continue the count of the one before
 
 
@@ -141,6 +142,25 @@ class Telemetry:
         """Newest decoded ephemeris of each satellite -> EPHEMERIS (n,)."""
         rows = [d.ephemeris for d in self.decoders.values() if d.ephemeris is not None]
         return np.array(rows, EPHEMERIS) if rows else np.zeros(0, EPHEMERIS)
+
+    def shared_orbits(self):
+        """Groups of GPS satellites that sent one and the same ephemeris -> list of lists of (system, prn).
+
+        LNAV does not say whose it is: all but one of a group are another's signal, found through the cross-correlation
+        of the codes. I/NAV names its satellite, and the decoder minds it.
+        """
+        groups = {}
+        for key, d in self.decoders.items():
+            if key[0] == "G" and d.ephemeris is not None:
+                groups.setdefault(tuple(d.ephemeris[list(_ORBIT)].item()), []).append(key)
+        return [keys for keys in groups.values() if len(keys) > 1]
+
+    def forget(self, system, prn):
+        """What the channels of this satellite said was not its own."""
+        self.decoders.pop((system, prn), None)
+        for c in [c for c in self._base if self._satellite(c) == (system, prn)]:
+            del self._base[c]
+            self._heard.pop(c, None)
 
     def iono_utc(self, system):
         """IONO_UTC record of the most complete decoder of ``system`` ("G" or "E"); None before anything came."""
