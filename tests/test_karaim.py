@@ -149,8 +149,8 @@ def _made_up(n_runs=50):
             r["rms"] *= 10 ** ((case.trial.js_db - 52.5) / 10)
             r["end_2d_m"] = np.where(np.arange(n_runs) < 5, 400.0, 1.0)
         if case.spec.mode == "scalar":
-            # Half of the channels go in 20 % of the runs at 32 dB, 60 % at 33.
-            share = {32: 0.2, 32.5: 0.4, 33: 0.6}.get(case.trial.js_db, float(case.trial.js_db > 33) * 1.0)
+            # Half of the channels go in 40 % of the runs at 32.5 dB, in 60 % at 33.
+            share = {32.5: 0.4, 33: 0.6}.get(case.trial.js_db, float(case.trial.js_db > 33) * 1.0)
             r["n_lost"] = np.where(np.arange(n_runs) < share * n_runs, 8, 0)
             r["no_fix"] = r["n_lost"] > 3
         runs[case.name] = r

@@ -30,11 +30,11 @@ from sdr.uttwin import EVERY, T_S, Policy, Sky, Trial
 from sdr.uttwin import run as run_trial
 from signals.jammers import CW, CodeLine, Narrowband
 
-SWEEP_DB = (0, 20, 25, 30, 32.5, 35, 40, 42.5, 45, 47.5, 50, 52.5, 55, 57.5, 60)
-TABLE_DB = (50, 52.5, 55, 57.5)
+SWEEP_DB = (0, 20, 25, 30, 32.5, 35, 40, 42.5, 45, 47.5, 50, 51, 52.5, 55, 57.5, 60)
+TABLE_DB = (50, 51, 52.5)
 """J/S at which the published table is sought."""
 QUICK_DB = (0, 20, 30, 40, 45, 50, 55, 60)
-SCALAR_DB = (27, 28, 29, 30, 31, 32, 33, 34, 35, 36)
+SCALAR_DB = (28, 29, 31, 33, 34, 36, 37, 38, 39)
 """J/S at which the scalar receiver is looked at more closely."""
 BANDWIDTH_HZ = 2400.0
 SETTLED_S = 10.0
@@ -222,8 +222,8 @@ def samples_cases(seed: int) -> list[SamplesCase]:
     """Every jammer with SAMPLES_SEEDS seeds."""
     return [
         SamplesCase(name, jammer, SAMPLES_SEEDS * seed + i)
-        for name, jammer in samples_jammers()
         for i in range(SAMPLES_SEEDS)
+        for name, jammer in samples_jammers()
     ]
 
 
