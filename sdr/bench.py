@@ -94,6 +94,9 @@ def bench(*, quick: bool = False, quiet: bool = False) -> dict[str, Any]:
     say(
         f"  synthesis, 10 sat     {synth / 1e6:6.0f} satellite*Msps   {synth_ratio:5.1f}; CBOC {cboc / 1e6:.0f} component*Msps"
     )
+    costs = _jammer_costs(3 * rounds)
+    for name, cost in costs.items():
+        say(f"  {name:22s}{cost['satellites']:6.2f} satellites, {cost['noise']:5.2f} thermal generators")
     share = _median([_monitors() for _ in range(rounds)])
     say(f"  live monitors         {100 * share:6.1f} % of the tracking of 8 channels with 35 taps")
     found_s = _median([_acquisition() for _ in range(rounds)])
@@ -116,6 +119,8 @@ def bench(*, quick: bool = False, quiet: bool = False) -> dict[str, Any]:
         "track_e1_pilot_data_cost": five / pilot,
         "synth_satellite_msps_per_core": synth / 1e6,
         "synth_cboc_component_cost": (synth / cboc),
+        "jammer_cost_satellites": {name: cost["satellites"] for name, cost in costs.items()},
+        "jammer_cost_noise": {name: cost["noise"] for name, cost in costs.items()},
         "monitors_share_of_tracking": share,
         "acquire_32_prn_s": found_s,
         "threads_2_speedup": speedup,
@@ -237,6 +242,55 @@ def _synthesis(signals: list[str], satellites: int) -> Job:
         return float(samples * components), time.thread_time() - begin
 
     return job
+
+
+JAMMERS = {
+    "CW": 'kind = "CW"',
+    "CW sweep 1 kHz/s": 'kind = "CW"\nrate_hz_s = 1e3',
+    "chirp 20 us": 'kind = "Chirp"\nsweep_hz = 3e6\nsweep_s = 20e-6',
+    "chirp 5 ms, triangle": 'kind = "Chirp"\nsweep_hz = 3e6\nsweep_s = 5e-3\nshape = "triangular"',
+    "pulsed 30 %": 'kind = "Pulsed"\nrate_hz = 1000\nduty = 0.3',
+    "DME 2700 pairs/s": 'kind = "Pulsed"\nrate_hz = 2700\nshape = "dme"',
+    "matched spectrum": 'kind = "MatchedSpectrum"',
+    "wide-band noise": 'kind = "Wideband"',
+    "noise of 10 kHz": 'kind = "Narrowband"\nbandwidth_hz = 1e4',
+    "noise of 100 kHz": 'kind = "Narrowband"\nbandwidth_hz = 1e5',
+    "noise of 1 MHz": 'kind = "Narrowband"\nbandwidth_hz = 1e6',
+}
+
+
+def _jammer_costs(rounds: int) -> dict[str, dict[str, float]]:
+    """What jammers and an echo add to the synthesis of 10 satellites, over a satellite and over the thermal noise.
+
+    One second of each in turn, thread CPU time; a satellite is a ninth of what 10 cost more than 1.
+    """
+    spec = _scenario(4.0 * rounds, 10, ["L1CA"])
+    texts = {name: f"jn0_dbhz = 70.0\nfreq_hz = 1e5\n{text}" for name, text in JAMMERS.items()}
+    texts["wide-band noise"] = 'jn0_dbhz = 70.0\nkind = "Wideband"'
+    sources = {
+        "": scenario.source(spec),
+        "one": scenario.source(_scenario(4.0 * rounds, 1, ["L1CA"])),
+        "silent": SyntheticSource(scenario.source(spec).sky, spec.front_end, spec.duration_s, 1, noise=False),
+    }
+    for name, text in texts.items():
+        sources[name] = scenario.source(_scenario(4.0 * rounds, 10, ["L1CA"], f"[[jammer]]\n{text}"))
+    name = sources[""].sky.satellites[0].name
+    echo = f'[multipath]\nkind = "Echoes"\nsatellites = ["{name}"]\nechoes = [{{ delay_s = 3e-7, power_db = -6.0 }}]'
+    sources["echo"] = scenario.source(_scenario(4.0 * rounds, 10, ["L1CA"], echo))
+    times: dict[str, list[float]] = {key: [] for key in sources}
+    for _ in range(rounds):
+        for key, source in sources.items():
+            source.read(round(0.1 * FS_HZ))
+            begin = time.thread_time()
+            source.read(round(FS_HZ))
+            times[key].append(time.thread_time() - begin)
+    least = {key: float(np.percentile(values, 25)) for key, values in times.items()}
+    satellite, noise = (least[""] - least["one"]) / 9, least[""] - least["silent"]
+    return {
+        key: {"satellites": (least[key] - least[""]) / satellite, "noise": (least[key] - least[""]) / noise}
+        for key in sources
+        if key not in ("", "one", "silent")
+    }
 
 
 def _acquisition() -> float:

@@ -124,6 +124,8 @@ class SyntheticSource:
         self._fused = [j for j in self.jammers if getattr(j, "fused", False)]
         self._added = [j for j in self.jammers if j not in self._fused]
         self._tables = _jammer_tables(self._fused)
+        steady = not any(j.spec.profile for j in self._fused)
+        self._level = _levels(self._fused, 0, 1) if steady else None
         seed = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
         self._seed = seed.generate_state(1, np.uint64)[0]
         self._sigma = np.float32(1.0 if noise else 0.0)
@@ -140,8 +142,7 @@ class SyntheticSource:
         self._ahead = 2 * threads if threads > 1 else 1
         self._pending: deque[Future | tuple] = deque()
         self._next_cell = 0
-        empty = np.zeros(0)
-        self._group: tuple[int, np.ndarray, np.ndarray, np.ndarray] = (-1, empty, empty, empty)
+        self._group: tuple = (-1,)
         self._cell = np.zeros((2, 0), front_end.dtype)
         self._used = 0
         self._position = 0
@@ -237,22 +238,24 @@ class SyntheticSource:
         """All that the kernel needs for one cell; what is slow and what is shared is done here, in order."""
         group, k = divmod(cell, CELLS_PER_S)
         if self._group[0] != group:
-            self._group = (group, *self._polynomials(group * CELLS_PER_S))
-        _, code, carrier, gain = self._group
+            parts = self._polynomials(group * CELLS_PER_S)
+            seen = parts[2].any(axis=2)
+            whole = (seen == seen[0]).all()
+            if whole and not seen.all():  # those below the horizon all this second
+                parts = tuple(part[:, seen[0]] for part in parts)
+            turns = [j.carrier(group) for j in self._fused]
+            turns = np.stack(turns, axis=1) if turns else np.zeros((CELLS_PER_S, 0, 4))
+            self._group = (group, *parts, seen, whole, turns)
+        _, code, carrier, gain, seen, whole, turns = self._group
         symbols, components = self._symbols(group // _SEGMENT_S)
-        periods = np.round(cell * _CELL_CHIPS / components["code_length_chips"]).astype(np.int64)
+        components = components if seen[k].all() else components[seen[k]]
+        periods = np.rint(cell * _CELL_CHIPS / components["code_length_chips"]).astype(np.int64)
         first, last, n_start = self._cells.place(cell)
         job = components, code[k], carrier[k], gain[k], periods
-        seen = gain[k].any(axis=1)
-        if not seen.all():
-            job = tuple(part[seen] for part in job)
-        carriers = [j.carrier(group)[k] for j in self._fused]
-        return first, last, n_start, *job, symbols, np.reshape(carriers, (-1, 4)), self._levels(first, last)
-
-    def _levels(self, first: int, last: int) -> np.ndarray:
-        """Amplitudes of the jammers over the blocks of a cell: float32 (J, 1) or (J, sub-blocks)."""
-        levels = [j.level(first, last) for j in self._fused]
-        return np.stack(np.broadcast_arrays(*levels)) if levels else np.zeros((0, 1), np.float32)
+        if not whole:
+            job = components, code[k][seen[k]], carrier[k][seen[k]], gain[k][seen[k]], periods
+        level = self._level if self._level is not None else _levels(self._fused, first, last)
+        return first, last, n_start, *job, symbols, turns[k], level
 
     def _polynomials(self, cell: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Code chips (cells, S, 4), carrier cycles, amplitude (cells, S, 2) of the cells of a second.
@@ -332,6 +335,12 @@ class SyntheticSource:
         if not self.complex:
             iq[1] = 0.0
         return self.front_end(iq)
+
+
+def _levels(runs, first: int, last: int) -> np.ndarray:
+    """Amplitudes of the jammers over blocks first .. last - 1: float32 (J, 1) or (J, sub-blocks)."""
+    levels = [run.level(first, last) for run in runs]
+    return np.stack(np.broadcast_arrays(*levels)) if levels else np.zeros((0, 1), np.float32)
 
 
 def _jammer_tables(runs) -> tuple[np.ndarray, ...]:
