@@ -1,8 +1,8 @@
 """A campaign point once more, on IF samples: the same jammer phase and echoes, the receiver's own channel.
 
-The trial's seed decides CW phase and echoes as in the twin; noise and data bits are drawn anew from it. A tracking
-channel follows the samples, and the monitors, trained as in the campaign, see its taps. Twin and samples are then
-compared second by second.
+The trial's seed decides CW phase and echoes as in the twin; noise, narrow-band jammers and data symbols are drawn anew
+from it. A tracking channel follows the samples, and the monitors, trained as in the campaign, see its taps. Twin and
+samples are then compared second by second: a two-sample test of the mean statistic and of the share of misses.
 """
 
 import math
@@ -18,12 +18,14 @@ from sdr.trials import fit_thresholds, offset_from_line_hz, quiet_statistics, sp
 from sdr.watch import one_blas_thread
 from signals.codes import primary_code
 from signals.constants import CHIP_RATE_HZ
+from signals.jammers import Narrowband
+from signals.modulation import SIGNALS, chip_waveform
 from tracking.channel import STATE_LOCKED, TrackingSpec
-from tracking.correlator_model import Twin, TwinCW, _cw_rows, _keys
+from tracking.correlator_model import Twin, TwinNBI, _cw_rows, _keys, jammer_hz
 from tracking.records import ACQUISITION
 
-FS_HZ = 5.0037e6
-"""A rate whose aliases of the chip spectrum keep the lines' amplitudes within 1 % over the code phase."""
+FS_HZ = {"L1CA": 5.0037e6, "E1B": 8.1907e6}
+"""Rates whose aliases of the chip spectrum keep the lines' amplitudes within 1 % over the code phase."""
 SLAB_S = 0.1
 LIMIT_S = 60.0
 """Length of signal that is synthesised at most."""
@@ -55,12 +57,12 @@ def confirm(name: str, point: int, *, overrides: Sequence[str] = (), quiet: bool
     rows = []
     for i, (monitor, run) in enumerate(runs.items()):
         with one_blas_thread():
-            a = _series(run, model[0]["t_s"][settle:], model[1][settle:], twin)
+            a = _series(run, model[0]["t_s"][settle:], model[1][settle:], twin, campaign.spec.dumps)
             late = t_s >= settle * T
-            b = _series(run, t_s[late], corr[late], twin)
+            b = _series(run, t_s[late], corr[late], twin, campaign.spec.dumps)
         rows.append({"monitor": monitor, "threshold": float(limits[i])} | _compare(a, b, float(limits[i])))
     result = {
-        "name": campaign.spec.name, "point": point, "axes": campaign.settings[point], "fs_hz": FS_HZ,
+        "name": campaign.spec.name, "point": point, "axes": campaign.settings[point], "fs_hz": FS_HZ[twin.signal],
         "duration_s": (settle + epochs) * T, "agree": all(r["agree"] for r in rows), "monitors": rows,
     }  # fmt: skip
     result["text"] = _text(result)
@@ -71,12 +73,20 @@ def _confirmable(campaign: Campaign, twin: Twin) -> tuple[int, float]:
     """Number and spacing of the taps; ValueError for what the sample path does not make."""
     taps = twin.tap_array_chips
     step = np.diff(taps)
-    if twin.signal != "L1CA" or campaign.spec.dumps != 1:
-        raise ValueError("--confirm: samples are made for L1CA with dumps = 1 only; choose such a point")
+    if twin.signal not in FS_HZ or (twin.signal == "E1B" and twin.waveform != "BOC11"):
+        raise ValueError(
+            '--confirm: samples are made for L1CA and for E1B with waveform = "BOC11"; choose such a point'
+        )
+    if campaign.spec.dumps != 1 and (twin.signal == "L1CA" or twin.data != twin.wiped):
+        raise ValueError(
+            "--confirm: sums of dumps are made on samples for E1B, without data or with data wiped"
+        )
+    if twin.fs_hz is not None or twin.bandwidth_hz is not None:
+        raise ValueError(
+            "--confirm: samples are made without a front-end filter; choose a point without bandwidth_hz and fs_hz"
+        )
     if twin.dynamics.at(np.array([1.0]))[1].any() or twin.dynamics.jerk_mps3:
         raise ValueError("--confirm: a point with dynamics is not made on samples; choose one without")
-    if any(not isinstance(j, TwinCW) for j in twin.jammers):
-        raise ValueError("--confirm: samples are made for CW jammers; choose such a point")
     if len(taps) % 2 == 0 or not np.allclose(step, step[0]) or not np.allclose(taps, -taps[::-1]):
         raise ValueError("--confirm: the taps must be evenly spaced about zero")
     return len(taps), float(step[0])
@@ -84,31 +94,36 @@ def _confirmable(campaign: Campaign, twin: Twin) -> tuple[int, float]:
 
 def _on_samples(twin: Twin, seed: Any, duration_s: float, count: int, spacing: float, quiet: bool) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Mid-times and taps (prompt = 1 at the signal's amplitude) of the locked integrations of one channel."""
-    samples = _Samples(twin, seed)
-    loops = {
+    fs_hz = FS_HZ[twin.signal]
+    samples = _Samples(twin, seed, duration_s)
+    loops: dict[str, Any] = {
         "integration_ms": round(twin.integration_s * 1e3), "early_late_space_chips": twin.early_late_space_chips,
         "pll_order": twin.pll_order, "pll_bw_hz": twin.pll_bandwidth_hz, "dll_bw_hz": twin.dll_bandwidth_hz,
         "code_discriminator": twin.code_discriminator, "taps": {"count": count, "spacing_chips": spacing},
-        "carrier_discriminator": twin.carrier_discriminator,
     }  # fmt: skip
-    tracker = TrackingSpec.model_validate({"l1ca": loops}).start(FS_HZ, 0.0)
+    if twin.signal == "E1B":
+        loops |= {"component": "data", "side_peak_protection": False}
+    else:
+        loops["carrier_discriminator"] = twin.carrier_discriminator
+    section = "l1ca" if twin.signal == "L1CA" else "e1"
+    tracker = TrackingSpec.model_validate({section: loops}).start(fs_hz, 0.0)
     start = np.zeros((), ACQUISITION)
     start["signal"], start["prn"], start["cn0_dbhz"], start["acquired"] = (
-        b"L1CA",
+        twin.signal.encode(),
         twin.prn,
         twin.cn0_dbhz,
         True,
     )
     c = tracker.add(start)
     t_s, out = [], []
-    n = round(SLAB_S * FS_HZ)
-    total = math.ceil(duration_s * FS_HZ / n)
+    n = round(SLAB_S * fs_hz)
+    total = math.ceil(duration_s * fs_hz / n)
     with _progress("samples", total, quiet) as advance:
         for k in range(total):
             epochs, counts, corr = tracker.process(k * n, samples.read(k * n, n))
             e, z = epochs[c, : counts[c]], corr[c, : counts[c], :count]
             locked = e["state"] == STATE_LOCKED
-            t_s.append((e["sample_index"][locked] + 0.5 * e["n_samples"][locked]) / FS_HZ)
+            t_s.append((e["sample_index"][locked] + 0.5 * e["n_samples"][locked]) / fs_hz)
             out.append(z[locked] / samples.amplitude)
             advance(k + 1)
     t, z = np.concatenate(t_s), np.concatenate(out)
@@ -122,21 +137,40 @@ def _on_samples(twin: Twin, seed: Any, duration_s: float, count: int, spacing: f
 class _Samples:
     """Signal, echoes, CW and noise of one trial; unit noise density of 1 per sample and component."""
 
-    def __init__(self, twin: Twin, seed: Any) -> None:
-        self.twin = twin
+    def __init__(self, twin: Twin, seed: Any, duration_s: float) -> None:
+        self.twin, self.fs_hz = twin, FS_HZ[twin.signal]
         _, symbol, _, rng, echo_seed, _ = _keys(seed)
         self.cws = _cw_rows(twin.model_copy(update={"fs_hz": None}), rng)
         self.echoes = twin.multipath.start(echo_seed) if twin.multipath else None
         fresh = np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, 99))
         self.rng = np.random.Generator(np.random.Philox(fresh))
         self.bits = np.random.default_rng(int(symbol)).integers(0, 2, 100_000) * 2.0 - 1.0
-        self.chips = primary_code("L1CA", twin.prn).astype(np.float32)
+        if twin.signal == "E1B" and not twin.data:
+            self.bits[:] = (
+                1.0  # C/A always has bits, which its synchronisation needs and no single epoch sees
+            )
+        slots = chip_waveform(twin.waveform or SIGNALS[twin.signal].waveform)
+        chips = primary_code(twin.signal, twin.prn)
+        self.slots = len(slots)
+        self.wave = (chips[:, None] * slots[None, :]).astype(np.float32).ravel()
+        self.symbol = len(chips) * (SIGNALS[twin.signal].symbol_periods or 1)
+        cn0_dbhz = twin.cn0_dbhz - twin.loss_db
         # C/N0 = A^2 fs / (2 sigma^2), sigma = 1.
-        self.amplitude = math.sqrt(2.0 * 10 ** ((twin.cn0_dbhz - twin.loss_db) / 10) / FS_HZ)
+        self.amplitude = math.sqrt(2.0 * 10 ** (cn0_dbhz / 10) / self.fs_hz)
+        self.noise = [
+            _narrowband(twin, j, cn0_dbhz).start(
+                self.fs_hz,
+                0.0,
+                duration_s + 1.0,
+                np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, 98, i)),
+            )
+            for i, j in enumerate(twin.jammers)
+            if isinstance(j, TwinNBI)
+        ]
 
     def read(self, n0: int, n: int) -> np.ndarray:
         """Samples n0 .. n0 + n - 1, float32 (2, n)."""
-        t = (n0 + np.arange(n)) / FS_HZ
+        t = (n0 + np.arange(n)) / self.fs_hz
         z = self._code(t, 0.0).astype(np.complex128)
         if self.echoes is not None and self.echoes.n_echo:
             z += self._echo(n0, n, t)
@@ -144,19 +178,22 @@ class _Samples:
             turn = phase + f * t + 0.5 * rate * t * t
             z += ratio * np.exp(2j * np.pi * (turn - np.floor(turn))) * ((t >= start) & (t < end))
         noise = self.rng.standard_normal((2, n), np.float32)
-        return (self.amplitude * np.stack([z.real, z.imag]) + noise).astype(np.float32)
+        iq = (self.amplitude * np.stack([z.real, z.imag]) + noise).astype(np.float32)
+        for run in self.noise:
+            run.add(iq, n0)
+        return iq
 
     def _code(self, t: np.ndarray, delay_s: Any) -> np.ndarray:
         x = CHIP_RATE_HZ * (t - delay_s) + self.twin.code_phase_chips
-        chip = np.floor(x).astype(np.int64)
-        return self.chips[chip % 1023] * self.bits[chip // 20460]
+        slot = np.floor(x * self.slots).astype(np.int64)
+        return self.wave[slot % len(self.wave)] * self.bits[slot // (self.slots * self.symbol)]
 
     def _echo(self, n0: int, n: int, t: np.ndarray) -> np.ndarray:
         """Echoes with gain and delay held for a millisecond."""
         step = 1e-3
-        first = math.floor(n0 / FS_HZ / step)
+        first = math.floor(n0 / self.fs_hz / step)
         assert self.echoes is not None
-        gain, delay_s = self.echoes.series((first + 0.5) * step, step, math.ceil(n / FS_HZ / step) + 2)
+        gain, delay_s = self.echoes.series((first + 0.5) * step, step, math.ceil(n / self.fs_hz / step) + 2)
         at = np.floor(t / step).astype(np.int64) - first
         total = np.zeros(n, np.complex128)
         for g, d in zip(gain, np.asarray(delay_s)):
@@ -164,14 +201,30 @@ class _Samples:
         return total
 
 
-def _series(run: Any, t_s: np.ndarray, corr: np.ndarray, twin: Twin) -> tuple[np.ndarray, np.ndarray]:
-    """Mid-times and values of a monitor on a series of epochs, those near the line or of a noise-like jammer."""
-    s = run.fresh()(sum_dumps(corr, 1))
+def _narrowband(twin: Twin, j: TwinNBI, cn0_dbhz: float) -> Narrowband:
+    """The noise of a twin as a jammer of samples."""
+    stop_s = None if math.isinf(j.end_s) else j.end_s
+    return Narrowband(
+        jn0_dbhz=j.js_db + cn0_dbhz, freq_hz=jammer_hz(twin, j), bandwidth_hz=j.bandwidth_hz, start_s=j.start_s, stop_s=stop_s
+    )  # fmt: skip
+
+
+def _series(
+    run: Any, t_s: np.ndarray, corr: np.ndarray, twin: Twin, dumps: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mid-times and values of a monitor on a series of epochs, those near the line or of noise that is on."""
+    if twin.wiped:  # by the signs that a receiver would find; a jammer takes them on
+        sign = np.where(corr[:, np.argmin(np.abs(twin.tap_array_chips))].real < 0, -1, 1).astype(np.float32)
+        corr = corr * sign[:, None]
+    s = run.fresh()(sum_dumps(corr, dumps))
     middle = np.maximum(s["epoch"] - span(run) // 2, 0)
-    t = t_s[middle]
+    t = sum_dumps(t_s[:, None], dumps)[:, 0][middle]
     if not twin.jammers:
         return t, s["value"]
-    near = np.abs(offset_from_line_hz(twin, t)) * twin.integration_s < 1.0
+    if isinstance(twin.jammers[0], TwinNBI):
+        on = (t >= twin.jammers[0].start_s) & (t < twin.jammers[0].end_s)
+        return t[on], s["value"][on]
+    near = np.abs(offset_from_line_hz(twin, t)) * twin.integration_s * dumps < 1.0
     return t[near], s["value"][near]
 
 
@@ -200,7 +253,7 @@ def _compare(a: tuple, b: tuple, threshold: float) -> dict[str, Any]:
 
 def _text(result: dict[str, Any]) -> str:
     rows = [
-        f"{result['name']}, point {result['point']}: {result['duration_s']:g} s on samples of {FS_HZ / 1e6:g} MHz against the twin"
+        f"{result['name']}, point {result['point']}: {result['duration_s']:g} s on samples of {result['fs_hz'] / 1e6:g} MHz against the twin"
     ]
     for r in result["monitors"]:
         rows.append(
