@@ -270,6 +270,44 @@ def _add_one(out_i, out_q, base, at_base, codes, at, roll, rot_i, rot_q, at_rot,
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST)
+def _add_pair(
+    out_i,
+    out_q,
+    base,
+    codes,
+    rot_i,
+    rot_q,
+    at_base,
+    at_rot,
+    next_rot,
+    at1,
+    at2,
+    roll1,
+    roll2,
+    w1,
+    w2,
+    next1,
+    next2,
+):
+    """`_add_one` for two components that follow each other: the sums are read and written once."""
+    b, d = _Q(at_base), _Q(at_base + 2 * SUB)
+    for sub in range(BLOCK // SUB):
+        p, r, t = _Q(sub * SUB), _Q(at_rot + sub), _Q(next_rot + sub)
+        c, e = _Q(at1) + p, _Q(at2) + p
+        u = w1 if sub * SUB < roll1 else next1
+        v = w2 if sub * SUB < roll2 else next2
+        re1, im1 = rot_i[r] * u, rot_q[r] * u
+        re2, im2 = rot_i[t] * v, rot_q[t] * v
+        for kk in range(SUB):
+            k = _Q(kk)
+            chip1, chip2 = _F(codes[c + k]), _F(codes[e + k])
+            x1, y1 = base[b + k], base[b + k + _Q(SUB)]
+            x2, y2 = base[d + k], base[d + k + _Q(SUB)]
+            out_i[p + k] += chip1 * (re1 * x1 - im1 * y1) + chip2 * (re2 * x2 - im2 * y2)
+            out_q[p + k] += chip1 * (re1 * y1 + im1 * x1) + chip2 * (re2 * y2 + im2 * x2)
+
+
+@njit(cache=True, nogil=True, fastmath=_FAST)
 def _add_two(
     out_i, out_q, base, at_base, codes, at1, at2, roll, rot_i, rot_q, at_rot, w1, w2, next_w1, next_w2
 ):
@@ -368,16 +406,25 @@ def _fetch_ahead(where, b, codes):
 def _add_block(out_i, out_q, b, base, rot_i, rot_q, where, weight, codes):
     """Add every component to block ``b`` of the call."""
     n_components, n_sub = where.shape[1], where.shape[0] * (BLOCK // SUB)
+    paired = False
     for c in range(n_components):
         at1, at2, roll = where[b, c, 0], where[b, c, 1], where[b, c, 2]
         w1, w2, next1, next2 = weight[b, c, 0], weight[b, c, 1], weight[b, c, 2], weight[b, c, 3]
         at_base, at_rot = 2 * SUB * c, n_sub * c + b * (BLOCK // SUB)
-        if at2 < 0:
-            _add_one(out_i, out_q, base, at_base, codes, at1, roll, rot_i, rot_q, at_rot, w1, next1)
-        else:
+        if at2 >= 0:
             _add_two(
                 out_i, out_q, base, at_base, codes, at1, at2, roll, rot_i, rot_q, at_rot, w1, w2, next1, next2
             )
+        elif paired:
+            paired = False  # added with the one before
+        elif c + 1 < n_components and where[b, c + 1, 1] < 0:
+            paired = True
+            _add_pair(
+                out_i, out_q, base, codes, rot_i, rot_q, at_base, at_rot, at_rot + n_sub, at1, where[b, c + 1, 0],
+                roll, where[b, c + 1, 2], w1, weight[b, c + 1, 0], next1, weight[b, c + 1, 2],
+            )  # fmt: skip
+        else:
+            _add_one(out_i, out_q, base, at_base, codes, at1, roll, rot_i, rot_q, at_rot, w1, next1)
         if roll < BLOCK and roll % SUB > 0 and (next1 != w1 or next2 != w2):
             re, im = rot_i[at_rot + roll // SUB], rot_q[at_rot + roll // SUB]
             _add_rest(out_i, out_q, base, at_base, codes, at1, at2, roll, re, im, next1 - w1, next2 - w2)

@@ -238,13 +238,13 @@ class SyntheticSource:
         """All that the kernel needs for one cell; what is slow and what is shared is done here, in order."""
         group, k = divmod(cell, CELLS_PER_S)
         if self._group[0] != group:
-            parts = self._polynomials(group * CELLS_PER_S)
-            seen = parts[2].any(axis=2)
-            whole = (seen == seen[0]).all()
+            parts: tuple[np.ndarray, ...] = self._polynomials(group * CELLS_PER_S)
+            seen = np.any(parts[2], axis=2)
+            whole = bool(np.all(seen == seen[0]))
             if whole and not seen.all():  # those below the horizon all this second
                 parts = tuple(part[:, seen[0]] for part in parts)
-            turns = [j.carrier(group) for j in self._fused]
-            turns = np.stack(turns, axis=1) if turns else np.zeros((CELLS_PER_S, 0, 4))
+            own = [j.carrier(group) for j in self._fused]
+            turns = np.stack(own, axis=1) if own else np.zeros((CELLS_PER_S, 0, 4))
             self._group = (group, *parts, seen, whole, turns)
         _, code, carrier, gain, seen, whole, turns = self._group
         symbols, components = self._symbols(group // _SEGMENT_S)
