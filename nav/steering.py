@@ -52,8 +52,9 @@ REFRESH_S = 1.0
 """Atmosphere and ephemerides are renewed this often."""
 MISSING_S = 5.0
 """A vector receiver that misses more satellites than it hears for this long lets go: its replicas are elsewhere."""
-INCONSISTENT_RATIO = 6.0
-"""Mean of NIS over its degrees of freedom through a second, beyond which the filter is not believed."""
+INCONSISTENT_RATIO = 2.5
+"""Mean of the normalised innovations squared (none above ``kernels.SURPRISE``) through a second, beyond which the filter is
+not believed: sensors of another unit, frame or start. It stays below 1.2 through a jam and an outage."""
 
 
 @dataclass(frozen=True)
@@ -127,6 +128,8 @@ class Steering:
         self.record = np.zeros(1, STEERING)
         self.sample = -1
         self._fix_since = self._coast_since = -1
+        self._seconds, self._released = {STEERED: 0.0, COASTING: 0.0}, ""
+        self._began_s: float | None = None
         self._n_released, self._estimate_isb, self._reference = 0, False, "G"
         self._slots()
 
@@ -192,6 +195,8 @@ class Steering:
             self._slots()
             return False
         self.state, self.reason, self._coast_since = STEERED, "", -1
+        if self._began_s is None:
+            self._began_s = sample / self.fs_hz
         return True
 
     def _begin(self, sample, solution, bias_m):
@@ -203,15 +208,20 @@ class Steering:
                 int(np.searchsorted(self._sensor_sample, sample, side="right")) - 1, len(self._table) - 1
             )
             speed = float(self._table[max(row, 0), 6])
+        moving = float(np.linalg.norm(vel))
+        has_odometer = self.sensors is not None and self.sensors.odometer is not None
+        if speed is not None and has_odometer and abs(speed - moving) > 1.0 + 0.2 * moving:
+            raise ValueError(
+                f"the odometer says {speed:.1f} m/s where the fix says {moving:.1f}: is it in m/s, and of this recording?"
+            )
         x = nominal_of(
             self.model, pos, vel, bias_m, float(solution["clock_drift_mps"]), 0.0, azimuth,
             speed if kernels.SCALE >= model_code(self.model) else None,
         )  # fmt: skip
-        moving = max(float(np.linalg.norm(vel)), 1.0)
         imu = self.sensors.imu_spec if self.sensors else None
         p = start_covariance(
             self.model, x, pos_m=self.spec.range_sigma_m, vel_mps=0.2, bias_m=2.0 * self.spec.range_sigma_m, drift_mps=0.3,
-            heading_rad=min(0.01 + 0.25 / moving, 0.3), imu=imu,
+            heading_rad=min(0.01 + 0.25 / max(moving, 1.0), 0.3), imu=imu,
         )  # fmt: skip
         barometer = self.sensors.barometer_spec if self.sensors else None
         self.filter = Filter(self.spec, self.model, x, p, SLOTS, self.log_length, barometer)
@@ -232,6 +242,7 @@ class Steering:
         self.state, self.reason, self.filter = LOST, reason, None
         self._fix_since, self._coast_since = -1, -1
         self._n_released += 1
+        self._released = f"{self.sample / self.fs_hz:.1f} s: {reason}"
         self._slots()
         return np.zeros(0, AIDING)
 
@@ -362,8 +373,8 @@ class Steering:
         if sample >= self._next_refresh:
             self.refresh(ephemerides())
         commands = np.zeros(len(channels_state), AIDING)
-        nis, rows, _ = self._step(sample, epochs, counts, commands)
-        self._judge(sample, nis, rows)
+        nis, rows, surprise = self._step(sample, epochs, counts, commands)
+        self._judge(sample, surprise, rows)
         self._report(sample, nis, rows)
         if self.state == LOST:
             return np.zeros(len(channels_state), AIDING)
@@ -376,7 +387,7 @@ class Steering:
         ms, frac_s = self._clock.read(sample)
         tow, tow_frac = _time_of_week(ms, frac_s)
         log, delay = f.slot(sample / self.fs_hz), self.delay + self.bias
-        nis, rows, seen = kernels.navigation_epoch(
+        nis, rows, surprise = kernels.navigation_epoch(
             f.code, f.x, f.p, sensors, dt_s, 1.0 / self.spec.update_hz, f.filter_s, f.rates, f.q, self.spec.limit_sigma, self.spec.fast_cn0_s,
             self.spec.slow_cn0_s, self.spec.code_floor_m, self.spec.rate_floor_mps, sample, self.fs_hz, ms, frac_s, tow,
             tow_frac, self.orbit, self.toe_toc_tgd, self.active, self.slot, self.second, self.period_s,
@@ -389,7 +400,7 @@ class Steering:
             rows -= int(np.sum((f.own > 0) & (self.inflate >= LEFT_OUT)))
         f.nis, f.n_rows = nis, rows
         self.sample = sample
-        return nis, rows, seen
+        return nis, rows, surprise
 
     def _sensors(self, sample):
         """Sensor rows of the epoch that ends at ``sample``; vector mode has one empty row."""
@@ -407,11 +418,11 @@ class Steering:
         """Ranges and unit vectors before the first step."""
         self.filter.rho[:] = 2.2e7 + self.filter.clock()[0]
 
-    def _judge(self, sample, nis, rows):
+    def _judge(self, sample, surprise, rows):
         """State from what is seen and how well the next interval is known."""
         f = self.filter
         if rows:
-            self._ratio += (min(nis / rows, 25.0) - self._ratio) / self.spec.update_hz
+            self._ratio += (surprise - self._ratio) / self.spec.update_hz
         sigma = np.zeros(2)
         usable, missing, heard = kernels.outlook(
             f.code, f.x, f.p, f.los, self.active, f.power, f.cn0, USABLE_CN0_HZ, sigma
@@ -435,7 +446,7 @@ class Steering:
         elif self.spec.mode == "vector" and self._missing_s > MISSING_S:
             why = f"{missing} satellites are not where they are predicted, {heard} are"
         elif usable >= self.spec.min_satellites and self._ratio > INCONSISTENT_RATIO:
-            why = f"innovations are {self._ratio:.0f} times what the filter expects"
+            why = f"innovations are {self._ratio:.1f} times what the filter expects"
         if why:
             self._sigma_2d = math.inf
             self.release(why)
@@ -444,8 +455,18 @@ class Steering:
         """Whether this epoch is one of those ``every_s`` apart."""
         return self.filter.epochs % max(1, round(every_s * self.spec.update_hz)) == 0
 
+    def summary(self) -> dict[str, Any]:
+        """How it went: from when on, for how long with and without satellites, how often it let go and why the last time."""
+        return {
+            "mode": self.spec.mode, "model": self.model.kind, "first_s": self._began_s,
+            "steered_s": self._seconds[STEERED], "coasting_s": self._seconds[COASTING], "released": self._n_released,
+            "reason": self._released or self.reason,
+        }  # fmt: skip
+
     def _report(self, sample, nis, rows):
         r = self.record[0]
+        if self.state != LOST:
+            self._seconds[self.state] += 1.0 / self.spec.update_hz
         r["sample_index"], r["t_s"], r["state"] = sample, sample / self.fs_hz, self.state
         r["nis"], r["rows"] = nis, rows
         r["sigma_range_m"], r["sigma_rate_mps"] = self.sigma

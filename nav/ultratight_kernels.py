@@ -62,6 +62,8 @@ innovations, C/N0 (Hz), signal power remembered from when it was strong; smoothe
 P_FAST, P_SLOW, N_FAST, WEIGHT, NIS_MEAN, CN0_HZ, SIGNAL, RANGE_M, RATE_MPS, RANGE_OFF_M, RATE_OFF_MPS = (
     range(11)
 )
+SURPRISE = 9.0
+"""Most that one row counts when the filter is judged as a whole: one bad channel must not condemn it."""
 OBSERVED_HZ = 1.0
 """Bandwidth in which ranges and rates are smoothed for observations: that of a scalar receiver's code loop."""
 STRONG = 10.0
@@ -671,7 +673,8 @@ def navigation_epoch(model, x, p, sensors, dt_s, every_s, filter_s, rates, q_dia
     """Predict, update from every channel's discriminators and steer: one call per navigation epoch.
 
     The epoch ends at receiver ``sample``; commands hold from there on. ``inflate`` (2C,) multiplies the variances of ranges
-    and rates, ``own`` (2C,) receives them without it, 0 where nothing was heard. Returns (NIS, rows, channels seen).
+    and rates, ``own`` (2C,) receives them without it, 0 where nothing was heard. Returns (NIS, rows, mean over the rows taken of their
+    normalised innovations squared, none above ``SURPRISE``).
     """
     n, count = p.shape[0], active.size
     sat_pos, sat_vel, sat_acc = np.empty((count, 3)), np.empty((count, 3)), np.empty((count, 3))
@@ -709,10 +712,12 @@ def navigation_epoch(model, x, p, sensors, dt_s, every_s, filter_s, rates, q_dia
     )  # fmt: skip
     observe(seen, span_s, z, gain_code, gain_rate, off_m, off_mps, rho, rate, before_m, before_mps, power)
     steer(active, slot, period_s, sample, rx_ms, rx_frac_s, rho, rate, accel, every_s, commands)
-    tracked = 0
-    for c in range(count):
-        tracked += seen[c] > 0
-    return nis, n_rows, tracked
+    surprise, n_used = 0.0, 0
+    for r in range(2 * count):
+        if used[r]:
+            surprise += min(z[r] * z[r] / s[r, r], SURPRISE)
+            n_used += 1
+    return nis, n_rows, surprise / max(n_used, 1)
 
 
 @njit(cache=True, nogil=True)

@@ -76,6 +76,11 @@ def receive(
     path = Path(output) if output else Path.cwd() / (Path(file).stem + ".results.h5")
     with Store(path, command="receive", scenario=text, seed=None) as store:
         sensors = scenario.read_sensors(name, overrides, imu, odometer, barometer, source)
+        if sensors is not None and spec.steering.mode != "ultra_tight":
+            raise ValueError(
+                f'--imu serves the ultra-tight receiver; this one is "{spec.steering.mode}": add '
+                "--set receiver.steering.mode=ultra_tight"
+            )
         result = _receive(spec, source, store, Path(file).name, quiet, sensors)
     return _finish(result, path, plots)
 
@@ -262,6 +267,7 @@ def _receive(
         "satellites": receiver.satellites(tally.locked_s),
         "monitors": _monitors(receiver, source),
         "protection": tally.stanford(source, receiver),
+        "steering": None if receiver.steering is None else receiver.steering.summary(),
     }
     result["monitor_totals"] = totals(result["monitors"])
     if side:
@@ -458,11 +464,21 @@ def _summary(result: dict[str, Any]) -> str:
             f"from {fix['first_s']:.1f} s on with {len(fix['used'])} satellites{error}"
         )
     rows += report_lines(result["monitors"], result["monitor_totals"])
+    if result["steering"]:
+        rows.append(_steering_text(result["steering"]))
     if result.get("modes"):
         rows += table(result["modes"])
     rows.append(f"results in {result['output']}")
     rows += [f"  {p}" for p in result.get("figures", [])]
     return "\n".join(rows)
+
+
+def _steering_text(s: dict[str, Any]) -> str:
+    head = f"{s['mode']} ({s['model']}):"
+    if s["first_s"] is None:
+        return f"{head} never steered: {s['reason']}"
+    text = f"{head} from {s['first_s']:.1f} s on, {s['steered_s']:.1f} s with satellites and {s['coasting_s']:.1f} s without"
+    return text + (f", let go {s['released']} times, the last at {s['reason']}" if s["released"] else "")
 
 
 @contextlib.contextmanager

@@ -1,15 +1,20 @@
 """Steering on IF samples: an outage bridged without acquisition, and a scalar receiver that steering leaves alone."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from nav import ultratight_kernels as kernels
+from nav.records import SOLUTION
+from nav.steering import Steering
 from nav.ultratight import COASTING, STEERED
 from sdr import scenario
 from sdr.receiver import Receiver
 from signals.faults import PowerDrop
 
 OUTAGE_S = (26.0, 34.0)
+SPACING = {"L1CA": 0.5, "E1": 0.25}
 
 
 def _outcomes(spec, mode, sensors):
@@ -129,3 +134,45 @@ def test_a_fault_shows_in_the_ranges_of_a_steered_channel():
     assert rho + power[:, kernels.RANGE_M] == pytest.approx(truth, abs=1.01 * left)
     assert power[:, kernels.RATE_MPS] == pytest.approx([0.5, 0.0], abs=1e-3)
     assert power[:, kernels.RANGE_OFF_M] == pytest.approx(truth - rho + 0.3, abs=1.1 * left)
+
+
+@pytest.mark.slow
+def test_two_systems_are_back_at_once_after_thirty_dark_seconds():
+    spec = scenario.load("drive-outage")[0]
+    dark = spec.fault[0].start_s, spec.fault[0].stop_s
+    assert dark[1] - dark[0] == 30.0
+    source, outcomes = _outcomes(spec, "ultra_tight", scenario.sensors(spec))
+    rows = np.concatenate([o.steering for o in outcomes if o.steering is not None])
+    fixes = np.concatenate([s for o in outcomes if o.steering is not None for s in o.solutions])
+    fixes = fixes[fixes["t_s"] > rows["t_s"][0]]
+    error = np.linalg.norm(fixes["pos_ecef_m"] - source.sky.receiver(fixes["t_s"])["pos_ecef_m"], axis=1)
+    claimed = np.sqrt(np.trace(fixes["cov_ecef_m2"], axis1=1, axis2=2))
+    before, t = (fixes["t_s"] > dark[0] - 5) & (fixes["t_s"] < dark[0]), fixes["t_s"]
+    assert rows["n_used"][(rows["t_s"] > dark[0] - 5) & (rows["t_s"] < dark[0])].min() == 12
+    # Galileo system time minus GPS's as the sky has it; the estimate's own noise is a decimetre or so.
+    ggto_m = 299_792_458.0 * float(source.sky.iono_utc["a0g_s"])
+    assert np.mean(fixes["isb_m"][before]) == pytest.approx(-ggto_m, abs=0.5)
+    # Dead reckoning: what the filter claims at the end holds, and is what the grade gives (gyro walk 1 deg/rt-h, odometer
+    # scale known to 0.2 %): below 2 m after 300 m of way.
+    end = (t > dark[1] - 0.5) & (t <= dark[1])
+    assert error[end].max() < 3.0 * claimed[end].max() < 6.0
+    # Every satellite within a second, without acquisition, and in its place.
+    assert rows["n_used"][rows["t_s"] > dark[1] + 1.0].min() == 12
+    assert not any(len(o.found) for o in outcomes if o.n0 > dark[1] * source.fs_hz)
+    assert error[t > dark[1] + 1.0].max() < 1.0
+
+
+def test_an_odometer_in_other_units_is_not_taken_over():
+    spec = scenario.load("drive-jam", ["duration_s=3.0"])[0].model_copy(update={"jammer": ()})
+    sensors = scenario.sensors(spec)
+    rows = sensors.odometer.copy()
+    rows["speed_mps"] *= 3.6
+    steering = Steering(
+        spec.receiver.steering.with_mode("ultra_tight"), 4e6, replace(sensors, odometer=rows), SPACING
+    )
+    fix = np.zeros((), SOLUTION)
+    state = scenario.source(spec).sky.receiver(np.array([2.0]))[0]
+    fix["pos_ecef_m"], fix["vel_ecef_mps"] = state["pos_ecef_m"], state["vel_ecef_mps"]
+    with pytest.raises(ValueError, match=r"the odometer says 3\d\.\d m/s where the fix says 10\.0"):
+        steering._begin(8_000_000, fix, 0.0)
+    assert steering.filter is None
