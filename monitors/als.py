@@ -435,6 +435,10 @@ class AlsRun:
             filt.reset(result.covariance)
         return result
 
+    def restart(self) -> None:
+        """The log begins anew, as after a reset of the filter by somebody else."""
+        self._seen = 0
+
     def look(self, take: Callable[[int], EpochLog], epochs: int = 1) -> AlsResult | None:
         """The same on any log that is ``epochs`` longer than at the last call; ``take(n)`` gives its last n."""
         spec, need = self.spec, self.spec.settle_epochs + self.spec.window_epochs

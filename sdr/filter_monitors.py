@@ -47,6 +47,9 @@ class FilterMonitors:
             return None, None
         self._innovations(log, sample, t_s, out)
         dx, p = self._parallel(watch, log, sample, t_s, out)
+        if p is not None and self._als is not None:
+            self._als.restart()
+            return dx, p
         retuned = self._noise(watch, log, sample, t_s, out)
         return dx, p if retuned is None else retuned
 

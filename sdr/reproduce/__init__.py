@@ -30,6 +30,7 @@ EXPERIMENTS = {
     "abdelhafez-bias": "sdr.reproduce.bias",
     "vanek1999": "sdr.reproduce.vanek",
     "karaim2020": "sdr.reproduce.karaim",
+    "integrity-live": "sdr.reproduce.live",
     "high-dynamics": "sdr.reproduce.aided_loops",
 }
 """Command-line name -> module with ``run``; imported only when asked for."""

@@ -1,7 +1,9 @@
-"""The integrity monitors on an ultra-tight GPS + Galileo receiver, on IF samples: noise, biases and ramps, answered and not.
+"""The integrity monitors on a receiver that steers its channels: noise, biases and ramps, answered and not.
 
-Each trial is one of the built-in scenarios ``integrity-ut-*`` with another size of noise or fault. Two receivers hear the same
-samples, one with ``[receiver.respond]`` and one without. Range noise is that of one discriminator output (20 ms) of GPS.
+On IF samples (not ``quick``): the built-in scenarios ``integrity-ut-*``, GPS + Galileo, two receivers on the same samples, one
+with ``[receiver.respond]`` and one without. For rates: a twin without samples, a steering filter on discriminators of the noise
+that the scenarios have, watched and answered by the same code. Range noise is that of one output (20 ms) of GPS; Galileo's
+pilots have 0.62 of it at the same C/N0.
 """
 
 from pathlib import Path
@@ -9,7 +11,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from nav import ultratight_kernels as kernels
+from nav.steering import LEFT_OUT, SLOTS, Steering
+from nav.ultratight import Filter, Kinematic, SteeringSpec, extended_q, start_covariance
 from sdr import scenario
+from sdr.integrity import IntegritySpec
 from sdr.modes import Tee
 from sdr.receiver import Receiver
 from sdr.reproduce import clopper_pearson, new_figure, row, save_figure, write_table
@@ -23,8 +29,105 @@ TAIL_S = 20.0
 """Errors and innovations are those of the last seconds."""
 NAMES = ("innovation", "raim", "bias_bank", "parallel_filters")
 NIS = 0.8, 1.2
-NEES = 0.0717, 12.84
-"""0.5 and 99.5 % of chi-square with 3 degrees of freedom: one error, which hardly changes within the tail."""
+
+
+FS_HZ, T_S, PER_LOOK, N, RATE_MPS = 1e6, 0.02, 10, 10, 0.1
+"""Of the twin: clock of sample indices, epoch, epochs per look, satellites, noise of range rates."""
+
+
+class Twin:
+    """A steering filter at rest under five GPS and five Galileo satellites, on discriminators of known noise, without samples.
+
+    Position, velocity and clock at 50 Hz; ``step`` is one epoch as `Steering` does it. ``claimed_m`` is the range noise that the
+    filter believes, ``sigma_m`` the true one, scalars or (N,).
+    """
+
+    heed, weaken = Steering.heed, Steering.weaken  # the answers as they are taken on samples
+
+    def __init__(self, sigma_m=5.0, claimed_m=5.0, seed=1):
+        self.rng, self.sigma_m, self.fs_hz, self.epoch = np.random.default_rng(seed), sigma_m, FS_HZ, 0
+        self.own = np.zeros(2 * SLOTS)
+        self.own[:N], self.own[SLOTS : SLOTS + N] = np.square(claimed_m), RATE_MPS**2
+        model = Kinematic(accel_psd_m2_s3=0.05, clock_phase_noise_m2_s=1e-3, clock_freq_noise_m2_s3=1e-3)
+        x = np.zeros(kernels.N_X)
+        x[:3] = 4.2e6, 0.8e6, 4.7e6
+        self.filter = f = Filter(
+            SteeringSpec(mode="vector"), model, x, start_covariance(model, x), SLOTS, 700
+        )
+        az, el = np.radians(36.0 * np.arange(N)), np.radians([70, 20, 35, 50, 15, 30, 60, 25, 40, 55])
+        f.los[:N] = np.column_stack([np.cos(el) * np.sin(az), np.cos(el) * np.cos(az), np.sin(el)])
+        self.truth, self.second = x.copy(), (np.arange(SLOTS) >= N // 2).astype(float)
+        self.active, self.inflate, self.bias = np.arange(SLOTS) < N, np.ones(2 * SLOTS), np.zeros(SLOTS)
+        self.name = [("L1CA" if k < N // 2 else "E1C", k + 1) if k < N else None for k in range(SLOTS)]
+        self._q, self._f = extended_q(model, x), np.zeros_like(f.p)
+        self._maps = np.empty((3, f.p.shape[0])), np.empty((3, f.p.shape[0]))
+
+    def step(self, fault_m=None):
+        """One epoch, with ``fault_m`` (N,) on the ranges."""
+        self.epoch += 1
+        f, log = self.filter, self.filter.slot(self.epoch * T_S)
+        z, var, used, h = log.r, log.var, log.used, log.h
+        ones = np.ones(SLOTS)
+        kernels.predict(
+            3,
+            f.x,
+            f.p,
+            np.zeros((1, 7)),
+            T_S,
+            1.0,
+            np.zeros(3),
+            self._q,
+            self._f,
+            log.phi,
+            log.qd,
+        )
+        h[:] = 0.0
+        kernels.rows(3, f.x, f.p.shape[0], f.los, self.second, ones, ones, *self._maps, h)
+        h[N:SLOTS] = h[SLOTS + N :] = 0.0
+        off = self.truth - f.x
+        z[:], used[:] = 0.0, False
+        used[:N] = used[SLOTS : SLOTS + N] = True
+        z[:N] = (
+            -f.los[:N] @ off[:3]
+            + off[6]
+            + self.second[:N] * off[kernels.ISB]
+            + self.sigma_m * self.rng.standard_normal(N)
+            - self.bias[:N]
+        )
+        z[:N] += 0.0 if fault_m is None else fault_m
+        z[SLOTS : SLOTS + N] = -f.los[:N] @ off[3:6] + off[7] + RATE_MPS * self.rng.standard_normal(N)
+        f.own[:] = self.own
+        var[:] = np.where(used, self.own, 1.0) * self.inflate
+        f.nis, f.n_rows = kernels.filter_update(
+            3, f.x, f.p, h, z, var, used, f.power, 0.0, log.k, log.s, log.p, f.dx
+        )
+
+
+def fly(monitors, respond=None, seconds=30.0, sigma_m=5.0, fault=None, seed=1, claimed_m=5.0):
+    """One flight of a Twin: (position error, NIS per row, NEES of the position) at 50 Hz, the monitors, rows by name, the Twin.
+
+    ``monitors``: keys of ``[receiver.integrity]`` or None; ``respond``: of ``[receiver.respond]``; ``fault(t_s)`` -> (N,) m.
+    """
+    sky, run = Twin(sigma_m, claimed_m, seed), None
+    if monitors is not None:
+        run = IntegritySpec.model_validate(monitors).start(RespondSpec.model_validate(respond or {}), FS_HZ)
+    track = np.empty((3, round(seconds / T_S)))
+    rows: dict[str, list[np.ndarray]] = {}
+    for k in range(track.shape[1]):
+        if run is not None and not run.response.spec.off:
+            sky.heed(run.remedy, {} if run.steered is None else run.steered.own_m2())
+        sky.step(None if fault is None else fault(k * T_S))
+        f = sky.filter
+        error = (sky.truth - f.x)[:3]
+        part = f.n_rows - 2 * int(np.sum(sky.inflate[:N] >= LEFT_OUT))
+        track[:, k] = np.linalg.norm(error), f.nis / part, error @ np.linalg.solve(f.p[:3, :3], error)
+        if run is None:
+            continue
+        run.gather(sky)
+        if sky.epoch % PER_LOOK == 0:
+            for name, found in run(round(sky.epoch * T_S * FS_HZ)).items():
+                rows.setdefault(name, []).append(found)
+    return track, run, {k: np.concatenate(v) for k, v in rows.items()}, sky
 
 
 class Cell(NamedTuple):
@@ -41,28 +144,65 @@ class Cell(NamedTuple):
             return f"noise {self.noise_m} m, bias {self.bias_m:g} m"
         return f"noise {self.noise_m} m" + (f", ramp {self.ramp_fps:g} ft/s" if self.ramp_fps else " alone")
 
+    @property
+    def kind(self) -> str:
+        """Which of the built-in scenarios it belongs to."""
+        return "bias" if self.bias_m else "ramp" if self.ramp_fps else "noise"
+
     def load(self, seed: int) -> scenario.Scenario:
         """The built-in scenario with this cell's sizes."""
         jam = f'jammer=[{{kind="Wideband", js_db={JS_DB[self.noise_m]}, against="{SUSPECT}", start_s=45.0}}]'
-        name, fault = "noise", ""
+        fault = ""
         if self.bias_m:
-            name, fault = "bias", f'kind="Step", step_m={self.bias_m}'
+            fault = f'kind="Step", step_m={self.bias_m}'
         elif self.ramp_fps:
-            name, fault = "ramp", f'kind="Ramp", rate_mps={self.ramp_fps * FT}'
+            fault = f'kind="Ramp", rate_mps={self.ramp_fps * FT}'
         overrides = [jam, f"seed={seed}"]
         if fault:
             overrides.append(f'fault=[{{{fault}, satellite="{SUSPECT}", start_s=50.0}}]')
-        return scenario.load(f"integrity-ut-{name}", overrides)[0]
+        return scenario.load(f"integrity-ut-{self.kind}", overrides)[0]
 
 
 CELLS = (
-    Cell(30), Cell(10, 10.0), Cell(10, 0.0, 1.0), Cell(10, 0.0, 2.0), Cell(30, 10.0), Cell(30, 20.0), Cell(30, 0.0, 2.0),
-    Cell(10), Cell(10, 20.0), Cell(10, 5.0), Cell(10, 0.0, 0.5), Cell(30, 0.0, 1.0), Cell(30, 5.0), Cell(30, 0.0, 0.5),
+    Cell(10), Cell(30), Cell(10, 5.0), Cell(10, 10.0), Cell(10, 20.0), Cell(30, 10.0), Cell(30, 20.0),
+    Cell(10, 0.0, 0.5), Cell(10, 0.0, 1.0), Cell(10, 0.0, 2.0), Cell(30, 0.0, 1.0), Cell(30, 0.0, 2.0),
 )  # fmt: skip
+ON_SAMPLES = Cell(30), Cell(10, 10.0), Cell(10, 0.0, 2.0)
+GALILEO = 0.62
+BELIEVED_M = 10.0
+"""Range noise that the filter believes where the noise alone is answered."""
+FLIGHT_S, FAULT_S = 60.0, 12.0
+
+
+def fly_cell(cell: Cell, seed: int) -> dict[str, Any]:
+    """The twin on one cell, as ``trial``; the suspect is the second GPS satellite."""
+    shape = cell.noise_m * np.where(np.arange(N) < N // 2, 1.0, GALILEO)
+    suspect, alone = "G02", not (cell.bias_m or cell.ramp_fps)
+    spec = scenario.load(f"integrity-ut-{cell.kind}")[0].receiver
+    assert spec.integrity is not None
+    monitors = spec.integrity.model_dump(exclude_unset=True)
+    monitors.pop("noise_rmd", None)
+
+    def fault(t_s: float) -> np.ndarray:
+        size = cell.bias_m + cell.ramp_fps * FT * (t_s - FAULT_S)
+        return np.where(np.arange(N) == 1, size if t_s >= FAULT_S else 0.0, 0.0)
+
+    out = {}
+    for name, respond in (("off", {}), ("on", spec.respond.model_dump(exclude_unset=True))):
+        track, run, _, sky = fly(
+            monitors, respond, FLIGHT_S, shape, fault, seed, BELIEVED_M if alone else shape
+        )
+        error, nis, nees = track[:, -round(TAIL_S / T_S) :]
+        claimed = float(np.sqrt(np.trace(sky.filter.p[:3, :3])))
+        out[name] = {
+            "error_m": float(np.sqrt(np.mean(error**2))), "claimed_m": claimed, "nees": float(nees.mean()),
+            "nis": float(nis.mean()), **alarms(run, suspect, FAULT_S),
+        }  # fmt: skip
+    return out
 
 
 def trial(cell: Cell, seed: int) -> dict[str, Any]:
-    """Both receivers on one cell: {"off": numbers, "on": numbers}, see ``numbers``."""
+    """Both receivers on the samples of one cell: {"off": numbers, "on": numbers}, see ``numbers``."""
     spec = cell.load(seed)
     tee = Tee(scenario.source(spec), 2)
     sensors = scenario.sensors(spec)
@@ -83,90 +223,87 @@ def trial(cell: Cell, seed: int) -> dict[str, Any]:
 
 
 def numbers(run: Receiver, solution: np.ndarray, sky: Any, started_s: float, end_s: float) -> dict[str, Any]:
-    """Of one receiver: first alarm on the suspect and satellites accused besides, by monitor; errors of the tail."""
-    assert run.integrity is not None
+    """Of one receiver: errors and innovations of the tail, and its alarms."""
     s = solution[solution["valid"] & (solution["t_s"] > end_s - TAIL_S)]
+    if not len(s):
+        raise ValueError("the receiver gave no position in the last seconds: nothing to compare")
     error = s["pos_ecef_m"] - sky.receiver(s["t_s"])["pos_ecef_m"]
     cov = s["cov_ecef_m2"]
     nees = np.einsum("ei,eij,ej->e", error, np.linalg.inv(cov), error)
-    out: dict[str, Any] = {
+    return {
         "error_m": float(np.sqrt(np.mean(np.sum(error**2, axis=1)))),
         "claimed_m": float(np.sqrt(np.trace(cov, axis1=1, axis2=2).mean())),
-        "nees": float(nees.mean()), "nis": float(s["chi2"].sum() / s["dof"].sum()), "delay_s": {}, "others": {},
+        "nees": float(nees.mean()), "nis": float(s["chi2"].sum() / s["dof"].sum()),
+        **alarms(run.integrity, SUSPECT, started_s),
     }  # fmt: skip
+
+
+def alarms(run: Any, suspect: str, started_s: float) -> dict[str, Any]:
+    """By monitor: seconds to the first alarm on the suspect (None: never), and satellites accused besides."""
+    out: dict[str, Any] = {"delay_s": {}, "others": {}}
     for name in NAMES:
+        if name not in run.alarms:
+            continue
         firsts = {
-            f"{key[0].decode()}{key[1]:02d}": [a["start_s"] for a in alarms if a["end_s"] > started_s]
-            for key, alarms in run.integrity.alarms[name].found.items()
+            f"{key[0].decode()}{key[1]:02d}": [a["start_s"] for a in found if a["end_s"] > started_s]
+            for key, found in run.alarms[name].found.items()
         }
-        mine = [t for t in firsts.pop(SUSPECT, []) if t > started_s]
+        mine = [t for t in firsts.pop(suspect, []) if t > started_s]
         out["delay_s"][name] = min(mine) - started_s if mine else None
         out["others"][name] = sorted(n for n, t in firsts.items() if t)
     return out
 
 
 def run(out_dir: Path, quick: bool = False, seed: int = 1) -> list[dict]:
-    """All cells (``quick``: the first), one trial each; rows and a figure."""
-    results = [(cell, trial(cell, seed)) for cell in (CELLS[:1] if quick else CELLS)]
-    rows = [line for cell, both in results for line in _rows(cell, both)]
-    rows += _rates(results)
+    """The twin on every cell, 5 flights each (``quick``: 1), and the three built-in scenarios on samples (not ``quick``)."""
+    flights = 1 if quick else 5
+    twin = [(cell, [fly_cell(cell, seed + k) for k in range(flights)]) for cell in CELLS]
+    rows = [line for cell, results in twin for line in _rows(cell.label, results)]
+    for cell in () if quick else ON_SAMPLES:
+        rows += _rows(f"on samples, {cell.label}", [trial(cell, seed)])
     write_table(rows, out_dir, "integrity-live")
-    _figure(results, out_dir)
+    _figure(twin, out_dir)
     return rows
 
 
-def _rows(cell: Cell, both: dict[str, Any]) -> list[dict]:
-    on, off = both["on"], both["off"]
+def _rows(label: str, results: list[dict[str, Any]]) -> list[dict]:
+    """Lines of one cell; error and claim are root mean squares, NIS and NEES means over the flights."""
 
-    def verdict(value: float, low: float, high: float) -> str:
-        return "reproduced" if low <= value <= high else "not reproduced"
+    def mean(which: str, key: str) -> float:
+        values = np.array([r[which][key] for r in results])
+        return float(np.sqrt(np.mean(values**2)) if key.endswith("_m") else values.mean())
 
-    delays = ", ".join(f"{n} {on['delay_s'][n]:.1f} s" for n in NAMES if on["delay_s"][n] is not None)
-    others = sorted({s for names in on["others"].values() for s in names})
-    note = f"first alarms: {delays or 'none'}; others accused: {' '.join(others) or 'none'}"
-    return [
-        row(f"{cell.label}: error off -> on (m)", off["error_m"], on["error_m"], note=note),
-        row(f"{cell.label}: claimed (m)", off["claimed_m"], on["claimed_m"], note="published = response off"),
-        row(f"{cell.label}: NIS / dof", "0.8 to 1.2", on["nis"], verdict=verdict(on["nis"], *NIS),
-            note=f"off {off['nis']:.2f}"),
-        row(f"{cell.label}: NEES of 3", "0.07 to 12.8", on["nees"], verdict=verdict(on["nees"], *NEES),
-            note=f"off {off['nees']:.1f}"),
+    n = len(results)
+    on = [r["on"] for r in results]
+    lines = [
+        row(f"{label}: 3-D error, last 20 s (m)", None, mean("on", "error_m"),
+            note=f"claimed {mean('on', 'claimed_m'):.2f}; without response {mean('off', 'error_m'):.2f}, "
+            f"claimed {mean('off', 'claimed_m'):.2f}"),
+        row(f"{label}: NIS over its degrees of freedom", None, mean("on", "nis"), note=f"without response {mean('off', 'nis'):.2f}"),
+        row(f"{label}: NEES of 3", None, mean("on", "nees"), note=f"without response {mean('off', 'nees'):.1f}"),
     ]  # fmt: skip
-
-
-def _rates(results: list[tuple[Cell, dict[str, Any]]]) -> list[dict]:
-    """Detection of the faults by each monitor, and wrong accusations, with 95 % intervals over all trials."""
-    faults = [both["off"] for cell, both in results if cell.bias_m or cell.ramp_fps]
-    rows = []
+    if "alone" in label:
+        return lines
     for name in NAMES:
-        n = len(faults)
-        for what, hits in (
-            ("named the right satellite", sum(f["delay_s"][name] is not None for f in faults)),
-            ("accused another", sum(bool(f["others"][name]) for f in faults)),
-        ):
-            low, high = clopper_pearson(hits, n) if n else (0.0, 1.0)
-            rows.append(
-                row(
-                    f"{name}: {what}",
-                    None,
-                    hits / max(n, 1),
-                    low,
-                    high,
-                    note=f"{hits} of {n} faults, response off",
-                )
-            )
-    return rows
+        delays = [r["delay_s"][name] for r in on if r["delay_s"].get(name) is not None]
+        low, high = clopper_pearson(len(delays), n)
+        wrong = sum(bool(r["others"].get(name)) for r in on)
+        after = f"median {np.median(delays):.1f} s" if delays else "never"
+        note = f"{len(delays)} of {n}, {after}; another accused in {wrong}"
+        lines.append(row(f"{label}: named by {name}", None, len(delays) / n, low, high, note=note))
+    return lines
 
 
-def _figure(results: list[tuple[Cell, dict[str, Any]]], out_dir: Path) -> None:
+def _figure(twin: list[tuple[Cell, list[dict[str, Any]]]], out_dir: Path) -> None:
     figure, axes = new_figure(2, 1, (9.0, 7.0), sharex=True)
-    at = np.arange(len(results))
+    at = np.arange(len(twin))
     for key, ax, label in (("error_m", axes[0], "3-D error, last 20 s (m)"), ("nis", axes[1], "NIS / dof")):
         for shift, name in ((-0.2, "off"), (0.2, "on")):
-            ax.bar(at + shift, [both[name][key] for _, both in results], 0.4, label=f"response {name}")
+            values = [np.mean([r[name][key] for r in results]) for _, results in twin]
+            ax.bar(at + shift, values, 0.4, label=f"response {name}")
         ax.set(ylabel=label, yscale="log")
         ax.legend(fontsize=8)
     for bound in NIS:
         axes[1].axhline(bound, color="k", lw=0.8, ls="--")
-    axes[1].set_xticks(at, [cell.label for cell, _ in results], rotation=40, ha="right", fontsize=7)
+    axes[1].set_xticks(at, [cell.label for cell, _ in twin], rotation=40, ha="right", fontsize=7)
     save_figure(figure, out_dir, "integrity-live")
