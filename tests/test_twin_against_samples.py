@@ -146,30 +146,41 @@ def test_multipath_distortion_of_the_taps(quiet):
 
 
 @pytest.mark.parametrize("bandwidth_hz", [1e3, 1e4, 1e5, 1e6])
-def test_narrow_band_noise_power(bandwidth_hz):
+@pytest.mark.parametrize("signal", ["L1CA", "E1B"])
+def test_narrow_band_noise_power(signal, bandwidth_hz):
     """Mean tap power of flat Gaussian noise around the line, 1 kHz to 1 MHz, from samples and from the twin."""
-    fs_hz, n_epochs = 4.096e6, 2048
-    settings = {"signal": "L1CA", "prn": 6, "cn0_dbhz": 80.0, "integration_s": 1e-3}
+    prn, waveform, integration_s, line_hz, fs_hz, n_epochs = {
+        "L1CA": (6, "BPSK", 1e-3, 227e3, 4.096e6, 2048),
+        "E1B": (38, "BOC11", 4e-3, 673.5e3, 8.192e6, 256),
+    }[signal]
+    settings = {
+        "signal": signal,
+        "prn": prn,
+        "waveform": waveform,
+        "cn0_dbhz": 80.0,
+        "integration_s": integration_s,
+    }
     twin = Twin(**settings, jammers=(TwinNBI(js_db=20.0, bandwidth_hz=bandwidth_hz),))
     d = twin.tap_array_chips
-    z = twin.start_open(1)(n_epochs) - autocorrelation("L1CA", 6, d)
-    n = 4096 * n_epochs
+    z = twin.start_open(1)(n_epochs) - autocorrelation(signal, prn, d, waveform)
+    length = round(integration_s * fs_hz)
+    n = length * n_epochs
     step_hz = fs_hz / n
     band = np.arange(
-        math.ceil((227e3 - bandwidth_hz / 2) / step_hz), math.floor((227e3 + bandwidth_hz / 2) / step_hz)
+        math.ceil((line_hz - bandwidth_hz / 2) / step_hz), math.floor((line_hz + bandwidth_hz / 2) / step_hz)
     )
     rng = np.random.default_rng(2)
     spectrum = np.zeros(n, np.complex64)
     g = rng.standard_normal((2, len(band)), np.float32)
     spectrum[band % n] = (g[0] + 1j * g[1]) * np.float32(10.0 / math.sqrt(2 * len(band)) * n)
-    x = sp_fft.ifft(spectrum, overwrite_x=True).reshape(n_epochs, 4096)
-    t = np.arange(4096) / fs_hz
-    replicas = np.stack([naive_twin.code_at("L1CA", 6, "BPSK", 1.023e6 * t + tap) for tap in d])
-    y = x @ (replicas.T / 4096).astype(np.complex64)
+    x = sp_fft.ifft(spectrum, overwrite_x=True).reshape(n_epochs, length)
+    t = np.arange(length) / fs_hz
+    replicas = np.stack([naive_twin.code_at(signal, prn, waveform, 1.023e6 * t + tap) for tap in d])
+    y = x @ (replicas.T / length).astype(np.complex64)
     power = [np.mean(np.abs(v) ** 2) for v in (y, z)]
     # Independent values of the mean: epochs times what the band holds of 1 / T, taps counted once. The lines of a code
     # sampled at one phase differ by up to 5 % from the ideal ones (interference note).
-    independent = n_epochs * min(1.0, bandwidth_hz * 1e-3)
+    independent = n_epochs * min(1.0, bandwidth_hz * integration_s)
     assert power[0] == pytest.approx(power[1], rel=Z * math.sqrt(2 / independent) + 0.05)
     # Epoch-to-epoch correlation agrees too: it is real below 1 / T, and none is left above.
     lag = [np.mean(v[1:] * v[:-1].conj()) / p for v, p in zip((y, z), power)]

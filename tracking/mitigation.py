@@ -67,11 +67,13 @@ class Blanking(BaseModel):
 
 
 class Excision(BaseModel):
-    """Bins of a short-time spectrum that exceed what white noise can do are zeroed.
+    """Bins of a short-time spectrum that exceed what noise can do are zeroed.
 
     Frames of ``length`` with half overlap and a square-root Hann window before and after, which add up to one. A bin
-    goes when its power exceeds ln(length / p_fa) times the median / ln 2 of the frame: ``p_fa`` per frame of white
-    noise.
+    goes when its power exceeds ln(length / p_fa) times the noise floor there: ``p_fa`` per frame of noise. The floor's
+    shape over frequency is the mean spectrum of some 65,536 samples under a median of an eighth of the band (it
+    follows the front end's filter and ignores what is narrower than half of that), its level the median / ln 2 of
+    each frame.
     """
 
     model_config = _FROZEN
@@ -95,9 +97,18 @@ class Excision(BaseModel):
         frames = np.concatenate([z[:-1], z[1:]], axis=1) * window
         spectrum = fft(frames, axis=1)
         power = spectrum.real**2 + spectrum.imag**2
-        limit = math.log(n / self.p_fa) / math.log(2) * np.median(power, axis=1, keepdims=True)
-        spectrum[power > limit] = 0.0
+        shape = _floor(np.mean(power, axis=0))
+        level = np.median(power / shape, axis=1, keepdims=True)
+        spectrum[power > math.log(n / self.p_fa) / math.log(2) * level * shape] = 0.0
         return ifft(spectrum, axis=1) * window, []
+
+
+def _floor(power: np.ndarray) -> np.ndarray:
+    """Mean power (n,) of FFT bins -> its median over an eighth of the band about each bin; never zero."""
+    from scipy.ndimage import median_filter
+
+    floor = median_filter(power, len(power) // 8 + 1, mode="wrap")
+    return np.maximum(floor, 1e-12 * max(float(floor.max()), 1e-30))
 
 
 class Notch(BaseModel):
