@@ -7,6 +7,7 @@ import json as jsonlib
 import os
 import signal
 import sys
+import threading
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -373,6 +374,7 @@ def _plain(value: Any) -> Any:
 def main() -> None:
     """Entry point: run a command; bad input is one sentence and exit code 2, an interrupt is 130."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
+    sys.unraisablehook = _interrupt_again
     try:
         app(exit_on_error=False, print_error=False)
     except CycloptsError as err:
@@ -389,6 +391,14 @@ def main() -> None:
         _fail(str(err))
     except MemoryError:
         _fail("not enough memory; use a shorter duration or a lower sample rate")
+
+
+def _interrupt_again(dropped: "sys.UnraisableHookArgs") -> None:
+    """Python drops an interrupt that falls into a destructor or a weak reference's callback: send it again."""
+    if not issubclass(dropped.exc_type, KeyboardInterrupt):
+        sys.__unraisablehook__(dropped)
+        return
+    threading.Timer(0.01, os.kill, (os.getpid(), signal.SIGINT)).start()
 
 
 def _fail(sentence: str) -> None:

@@ -12,6 +12,8 @@ import h5py
 import numpy as np
 import pytest
 
+from sdr import __main__ as command_line
+
 GNSSBB = [sys.executable, "-m", "sdr"]
 SHORT = ["--set", "duration_s=1"]
 
@@ -160,3 +162,14 @@ def test_full_disk_is_one_sentence_and_keeps_the_last_checkpoint(tmp_path):
     assert done.returncode == 2
     assert "Traceback" not in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1, done.stderr
+
+
+def test_an_interrupt_in_a_destructor_is_not_lost(monkeypatch):
+    class Dying:
+        def __del__(self):
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(sys, "unraisablehook", command_line._interrupt_again)
+    with pytest.raises(KeyboardInterrupt):
+        Dying()
+        time.sleep(10)

@@ -3,9 +3,7 @@
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
 
-from sdr import jobs
 from sdr.receiver import Receiver
 from sdr.scenario import ReceiverSpec
 from signals.records import EPHEMERIS
@@ -34,15 +32,3 @@ def test_the_strongest_of_one_orbit_is_kept():
     assert set(receiver.channel_of) == {("L1CA", 1), ("L1CA", 7)}
     assert {int(e["prn"]) for e in receiver.telemetry.ephemerides()} == {1, 7}
     assert not receiver.telemetry.has_ephemeris("L1CA", 12)
-
-
-@pytest.mark.slow
-def test_position_beside_a_satellite_20_db_stronger(tmp_path):
-    """Unless the images are given up, the position is tens of kilometres off."""
-    sky = [
-        "sky.cn0_dbhz=40",
-        'sky.cn0_model="constant"',
-        'sky.satellite=[{system="G", prn=1, cn0_dbhz=60.0}]',
-    ]
-    result = jobs.run("demo", output=tmp_path / "out.h5", overrides=[*sky, "duration_s=50"], quiet=True)
-    assert result["fix"]["rms_3d_m"] < 5.0
