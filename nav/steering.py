@@ -388,7 +388,7 @@ class Steering:
         tow, tow_frac = _time_of_week(ms, frac_s)
         log, delay = f.slot(sample / self.fs_hz), self.delay + self.bias
         nis, rows, surprise = kernels.navigation_epoch(
-            f.code, f.x, f.p, sensors, dt_s, 1.0 / self.spec.update_hz, f.filter_s, f.rates, f.q, self.spec.limit_sigma, self.spec.fast_cn0_s,
+            f.code, f.x, f.p, sensors, dt_s, 1.0 / self.spec.update_hz, f.epochs, self.spec.block, f.filter_s, f.rates, f.q, self.spec.limit_sigma, self.spec.fast_cn0_s,
             self.spec.slow_cn0_s, self.spec.code_floor_m, self.spec.rate_floor_mps, sample, self.fs_hz, ms, frac_s, tow,
             tow_frac, self.orbit, self.toe_toc_tgd, self.active, self.slot, self.second, self.period_s,
             delay, self.delay_rate, self.inflate, self._tables, self.which, epochs, counts, f.power, f.cn0,
@@ -397,7 +397,7 @@ class Steering:
         )  # fmt: skip
         # Rows that weigh nothing are no degrees of freedom.
         if self.inflate.max() >= LEFT_OUT:
-            rows -= int(np.sum((f.own > 0) & (self.inflate >= LEFT_OUT)))
+            rows = max(0, rows - int(np.sum((f.own > 0) & (self.inflate >= LEFT_OUT))))
         f.nis, f.n_rows = nis, rows
         self.sample = sample
         return nis, rows, surprise

@@ -81,6 +81,8 @@ class SteeringSpec(BaseModel):
     """Time constant of the C/N0 it is compared with."""
     limit_sigma: Annotated[float, Field(ge=0)] = 4.0
     """Innovations beyond it are weighed down to it; 0: never."""
+    prefilter_hz: Annotated[float | None, Field(gt=0, le=100)] = None
+    """Each channel averages its innovations and gives them to the filter at this rate; None: at every update."""
     code_floor_m: Annotated[float, Field(ge=0)] = 0.05
     """Least standard deviation of a range."""
     code_noise_m: Annotated[float | None, Field(gt=0, le=1000)] = None
@@ -102,7 +104,17 @@ class SteeringSpec(BaseModel):
             raise ValueError(
                 'mode = "ultra_tight" needs an inertial model: "riss_sf", "riss11", "ecef17" or "pinson13"'
             )
+        per_block = self.update_hz / (self.prefilter_hz or self.update_hz)
+        if per_block < 1 or abs(per_block - round(per_block)) > 1e-9:
+            raise ValueError(
+                f"prefilter_hz = {self.prefilter_hz:g} does not divide update_hz = {self.update_hz:g}: a block is whole updates"
+            )
         return self
+
+    @property
+    def block(self) -> int:
+        """Updates that one block of the pre-filter takes."""
+        return 1 if self.prefilter_hz is None else round(self.update_hz / self.prefilter_hz)
 
     def with_mode(self, mode):
         """The same settings as another receiver."""

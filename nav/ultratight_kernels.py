@@ -55,13 +55,14 @@ about up, from east and north (rad), and the last height read (m, NaN: none)."""
 N_X, ACC, ISB = 32, 27, 30
 """Length of the nominal state; ECEF acceleration (3) of the last prediction; inter-system bias, m."""
 
-N_CN0 = 11
+N_CN0 = 15
 """Columns of what is kept of a channel: prompt power fast and slow, noise power fast, time watched, mean of squared range
 innovations, C/N0 (Hz), signal power remembered from when it was strong; smoothed range and rate, measured minus predicted
-(m, m/s), and the same measured minus NCO."""
+(m, m/s), and the same measured minus NCO; of the pre-filter, weighted sums of innovations and their weights, range and rate."""
 P_FAST, P_SLOW, N_FAST, WEIGHT, NIS_MEAN, CN0_HZ, SIGNAL, RANGE_M, RATE_MPS, RANGE_OFF_M, RATE_OFF_MPS = (
     range(11)
 )
+PRE_RANGE, PRE_RANGE_WEIGHT, PRE_RATE, PRE_RATE_WEIGHT = range(11, 15)
 SURPRISE = 9.0
 """Most that one row counts when the filter is judged as a whole: one bad channel must not condemn it."""
 OBSERVED_HZ = 1.0
@@ -621,6 +622,28 @@ def weigh(code_m, rate_mps, off_m, off_mps, span_s, seen, cn0, inflate, tables, 
 
 
 @njit(cache=True, nogil=True)
+def prefilter(z, var, used, gain_code, gain_rate, power, last):
+    """Average each channel's innovations over a block of epochs; the filter gets one at its ``last`` and none before.
+
+    y = sum w z / g / sum w with w = g^2 / R has gain 1 and variance 1 / sum w. The filter only predicts within a block, so
+    all of it refers to one error; the sums begin anew with each, which leaves the blocks' noise white.
+    """
+    count = gain_code.size
+    for c in range(count):
+        for kind in range(2):
+            r, at = c + kind * count, PRE_RANGE + 2 * kind
+            gain = gain_code if kind == 0 else gain_rate
+            if used[r]:
+                power[c, at] += gain[c] / var[r] * z[r]
+                power[c, at + 1] += gain[c] * gain[c] / var[r]
+            used[r] = last and power[c, at + 1] > 0.0
+            if used[r]:
+                z[r], var[r], gain[c] = power[c, at] / power[c, at + 1], 1.0 / power[c, at + 1], 1.0
+            if last:
+                power[c, at] = power[c, at + 1] = 0.0
+
+
+@njit(cache=True, nogil=True)
 def observe(seen, span_s, z, gain_code, gain_rate, off_m, off_mps, rho, rate, before_m, before_mps, power):
     """What each channel measured in itself, for observations: y <- y + k (z / g - y), z / g = measured - predicted.
 
@@ -666,7 +689,7 @@ def steer(active, slot, period_s, sample, rx_ms, rx_frac_s, rho, rate, accel, ev
 
 
 @njit(cache=True, nogil=True)
-def navigation_epoch(model, x, p, sensors, dt_s, every_s, filter_s, rates, q_diag, limit, fast_s, slow_s, floor_m, floor_mps,
+def navigation_epoch(model, x, p, sensors, dt_s, every_s, epoch, block, filter_s, rates, q_diag, limit, fast_s, slow_s, floor_m, floor_mps,
                      sample, fs_hz, rx_ms, rx_frac_s, tow_whole, tow_frac, orbit, toe_toc_tgd, active, slot, second,
                      period_s, delay, delay_rate, inflate, tables, which, epochs, counts, power, cn0, rho, rate, accel,
                      los, f, phi, qd, h, z, var, own, used, k, s, p_prior, dx, commands):  # fmt: skip
@@ -704,13 +727,16 @@ def navigation_epoch(model, x, p, sensors, dt_s, every_s, filter_s, rates, q_dia
         gain_code, gain_rate,
     )  # fmt: skip
     own[:] = np.where(used, var / inflate, 0.0)
+    z_now, g_code, g_rate = z.copy(), gain_code.copy(), gain_rate.copy()
+    if block > 1:
+        prefilter(z, var, used, gain_code, gain_rate, power, epoch % block == 0)
     rows(model, x, n, los, second, gain_code, gain_rate, tp, tv, h)
     nis, n_rows = filter_update(model, x, p, h, z, var, used, power, limit, k, s, p_prior, dx)
     before_m, before_mps = rho.copy(), rate.copy()
     pseudoranges(
         model, x, active, second, sat_pos, sat_vel, sat_acc, clock, clock_rate, delay, delay_rate, rho, rate, accel, los
     )  # fmt: skip
-    observe(seen, span_s, z, gain_code, gain_rate, off_m, off_mps, rho, rate, before_m, before_mps, power)
+    observe(seen, span_s, z_now, g_code, g_rate, off_m, off_mps, rho, rate, before_m, before_mps, power)
     steer(active, slot, period_s, sample, rx_ms, rx_frac_s, rho, rate, accel, every_s, commands)
     surprise, n_used = 0.0, 0
     for r in range(2 * count):

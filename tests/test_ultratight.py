@@ -255,6 +255,27 @@ def test_nco_state_is_the_point_of_linearisation(period_s):
     assert (gains[0][0], gains[1][0]) == (row[0], row[2])
 
 
+def test_a_prefiltered_block_is_the_best_mean_of_its_epochs():
+    rng, n = np.random.default_rng(2), 5
+    power = np.zeros((2, kernels.N_CN0))
+    var = rng.uniform(0.5, 4.0, (n, 4))
+    gain = rng.uniform(0.2, 1.0, (n, 4))
+    z = rng.standard_normal((n, 4)) * 3.0
+    heard = np.ones((n, 4), np.bool_)
+    heard[1:3, [0, 2]] = False  # a channel without integrations in some epochs
+    for e in range(n):
+        zz, v, used, g = z[e].copy(), var[e].copy(), heard[e].copy(), (gain[e, :2].copy(), gain[e, 2:].copy())
+        kernels.prefilter(zz, v, used, *g, power, e == n - 1)
+        assert np.all(used == (e == n - 1))
+    w = np.where(heard, gain**2 / var, 0.0)
+    assert zz == pytest.approx((w * z / gain).sum(0) / w.sum(0))
+    assert v == pytest.approx(1.0 / w.sum(0))
+    assert np.all(np.concatenate(g) == 1.0)
+    assert not power.any()
+    with pytest.raises(ValueError, match="does not divide"):
+        SteeringSpec(mode="ultra_tight", prefilter_hz=15.0)
+
+
 def test_gains_scale_the_rows():
     model = RissSf()
     x, n, los = _nominal(model), 10, np.eye(3)[:2]
