@@ -149,7 +149,7 @@ class NoiseFloor(_Spec):
 
 class SignalQuality(_Spec):
     """Shape of the peak: delta (I_E - I_L) / (2 I_P) or ratio (I_E + I_L) / (2 I_P), modulus of the
-    deviation.
+    deviation, weighted with the prompt's amplitude (``_QualityRun``).
 
     Taps: those nearest to +-``offset_chips``. Null model: Gaussian deviation, so the statistic is half-normal
     (Phelps, Akos et al. 2000s SQM metrics; Irsigler & Hein, ION GNSS 2005). Cost: three taps.
@@ -181,11 +181,36 @@ class SignalQuality(_Spec):
             return total.sum(axis=1) / (2 * np.abs(i[:, :, p]).sum(axis=1))
 
         length = _window(self.window_s, integration_s, 1)
-        return _ModulusRun(f"SQM {self.metric}", metric, len(taps_chips), length, integration_s)
+        return _QualityRun(f"SQM {self.metric}", metric, p, len(taps_chips), length, integration_s)
 
 
-class _ModulusRun(_WindowRun):
-    """Two-sided: the modulus of the standardised deviation."""
+class _QualityRun(_WindowRun):
+    """Two-sided: modulus of the deviation, weighted with the prompt over its trained mean, standardised.
+
+    The noise of a ratio grows as its denominator fades; the weight undoes that.
+    """
+
+    def __init__(self, name, quantity, prompt, n_taps, length, integration_s):
+        super().__init__(name, quantity, n_taps, length, integration_s)
+        self.prompt, self.metrics, self.prompts = prompt, _Moments(name), _Moments(name)
+
+    def values(self, corr):
+        """Weighted deviation of each whole window, float64."""
+        metric, weight = self._parts(corr)
+        return (metric - self.metrics.mean) * weight / self.prompts.mean
+
+    def _parts(self, corr):
+        m = len(corr) // self.length
+        z = corr[: m * self.length].reshape(m, self.length, self.n_taps)
+        return self.quantity(z), np.abs(z[:, :, self.prompt].real.astype(float)).mean(axis=1)
+
+    def train(self, corr):
+        """Add quiet epochs, complex64 (n, K)."""
+        corr = checked_corr(corr, self.n_taps)
+        metric, weight = self._parts(corr)
+        self.metrics.add(metric)
+        self.prompts.add(weight)
+        self.moments.add(self.values(corr))
 
     def __call__(self, corr, sample_index=None):
         out = super().__call__(corr, sample_index)

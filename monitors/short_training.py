@@ -39,31 +39,35 @@ def _check(n, what):
 class StudentNull:
     """A Gaussian quantity less the mean of its training, over the training's standard deviation.
 
-    P(x > t) = P(t_{n-1} > t / sqrt(1 + 1/n)), doubled where the modulus is tested; n independent training values.
+    P(x > t) = P(t_{n-1} > (t - shift) / sqrt(1 + 1/n)), doubled where the modulus is tested; n independent training values.
     """
 
     n_effective: float
     two_sided: bool = False
+    shift: float = 0.0
     rule: str = "student"
 
     @classmethod
-    def fit(cls, values, two_sided=False):
-        """From the training's own values, in time order."""
+    def fit(cls, values, two_sided=False, rise=0.0):
+        """From the training's own values, in time order; ``rise``, in their unit, is allowed for besides."""
         n = independent_values(values)
         _check(n, "training values")
-        return cls(n, two_sided)
+        return cls(n, two_sided, rise / max(float(np.std(values, ddof=1)), 1e-12))
 
     def sf(self, x):
         """P(false alarm) at threshold x."""
         from scipy.stats import t
 
-        return (2 if self.two_sided else 1) * t.sf(np.asarray(x) / self._scale(), self.n_effective - 1)
+        return (2 if self.two_sided else 1) * t.sf(
+            (np.asarray(x) - self.shift) / self._scale(), self.n_effective - 1
+        )
 
     def isf(self, p_fa):
         """Threshold."""
         from scipy.stats import t
 
-        return float(t.isf(p_fa / (2 if self.two_sided else 1), self.n_effective - 1)) * self._scale()
+        quantile = float(t.isf(p_fa / (2 if self.two_sided else 1), self.n_effective - 1))
+        return quantile * self._scale() + self.shift
 
     def _scale(self):
         return math.sqrt(1 + 1 / self.n_effective)

@@ -33,6 +33,7 @@ from signals.clock import ClockSpec
 from signals.faults import FaultSpec, faulty
 from signals.frontend import FrontEndSpec
 from signals.jammers import JammerRun, JammerSpec
+from signals.modulation import SIGNALS
 from signals.multipath import EchoRun, MultipathSpec
 from signals.sky import Sky, SkySpec
 from signals.source import SyntheticSource
@@ -84,12 +85,13 @@ class ReceiverSpec(BaseModel):
                 f"receiver.respond.weaken wants an answer of '{missing[0]}', which is off: add [[receiver.monitor]] of that name"
             )
         loops = {"G": ("l1ca", self.tracking.l1ca), "E": ("e1", self.tracking.e1)}
+        watched = {SIGNALS[s].system for m in self.monitor if not m.of_front_end for s in m.signals}
         for system in self.acquisition.systems:
             section, spec = loops[system]
-            if self.monitor and spec.taps is None:
+            if system in watched and spec.taps is None:
                 raise ValueError(
                     f"monitors need a window of taps: give receiver.tracking.{section}.taps = {{ count = 35, "
-                    "spacing_chips = 0.65 } or the like"
+                    "spacing_chips = 0.65 } or the like, or name the signals they watch"
                 )
         return self
 
@@ -228,6 +230,9 @@ def _interferer(path: str, fs_hz: float) -> tuple[Callable[[int, int], np.ndarra
     """Random access to a recording as interferer: reader(n0, n) -> float32 (2, n) at zero frequency, and its length."""
     from sdr import iffile
 
+    shipped = Path(str(files("sdr") / "scenarios")) / Path(path).name
+    if not Path(path).exists() and path == shipped.name and shipped.exists():
+        path = str(shipped)  # a recording that comes with the built-in scenarios
     file = iffile.open_recording(path, iffile.declaration(path))
     if abs(file.fs_hz - fs_hz) > 1e-9 * fs_hz:
         raise ValueError(

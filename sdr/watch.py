@@ -57,6 +57,9 @@ class WatchSpec(BaseModel):
     """Threshold given outright, instead of by ``p_fa``."""
     expect_multipath: MultipathSpec | None = None
     """Echoes that must not alarm (FFT and AR)."""
+    noise_rise_db: float = Field(0.3, ge=0, le=10)
+    """Rise of the correlators' noise that must not alarm (GLRT, AR, noise floor, C/N0): other satellites' codes that come
+    into step."""
     settle_s: float = Field(3.0, ge=0, le=3600)
     """Time from lock to training."""
     training_s: float = Field(20.0, ge=0.1, le=3600)
@@ -231,6 +234,7 @@ class _Channel:
         if not locked:
             return out
         self._next = int(ends[-1])
+        self.post.seen_s += (self._next - first) / self.fs_hz
         self._resume(first)
         settled = int(np.searchsorted(index, self._settled))
         if self.threshold is None:

@@ -116,7 +116,7 @@ def _lanes(ax: Any, h5: h5py.File, names: list[str], limits: np.ndarray, colors:
 
 def _jammers(ax: Any, h5: h5py.File, hit: str | None) -> None:
     """J/S; of tones, how far they are from the nearest code line of the channel that is hit most."""
-    rows = h5["truth/jammers"][:] if "truth/jammers" in h5 else np.empty(0)
+    rows: Any = h5["truth/jammers"][:] if "truth/jammers" in h5 else np.empty(0)
     lines = ax.twinx()
     for k in np.unique(rows["jammer"]) if len(rows) else ():
         mine = rows[(rows["jammer"] == k) & (rows["on"] != 0)]

@@ -31,12 +31,15 @@ class FrontWatch:
         self._adc = isinstance(spec.detector, AdcHistogram)
         self._length = min(spec.detector.samples, math.floor(window_s * fs_hz)) if self._adc else 1
         self._window = math.ceil(spec.settle_s / window_s)
-        self._counts = np.zeros(256, np.int64)
+        self._parts: list[np.ndarray] = []
         self._scale = 0.0
 
     def hear(self, n0: int, iq: np.ndarray, source: Any) -> np.ndarray:
         """MONITOR rows of the windows that the samples n0 .. complete."""
         rows: list[np.ndarray] = []
+        if not self._adc and self._gain(n0, source) is None:
+            return joined(rows)
+        self.post.seen_s = (n0 + iq.shape[1]) / self.fs_hz
         while (first := self._first()) < n0 + iq.shape[1]:
             value = self._histogram(first - n0, iq, source) if self._adc else self._gain(first, source)
             if value is None:
@@ -58,15 +61,16 @@ class FrontWatch:
 
     def _histogram(self, at: int, iq: np.ndarray, source: Any) -> np.ndarray | None:
         """Counts of the window that begins at ``at`` in this slab; None while it is not whole."""
-        part = iq[:, max(at, 0) : at + self._length]
+        self._parts.append(iq[:, max(at, 0) : at + self._length])
+        if at + self._length > iq.shape[1]:
+            return None
+        part, counts = np.concatenate(self._parts, axis=1), np.zeros(256, np.int64)
+        self._parts = []
         if part.dtype != np.int8:
             part = self._levels(part)
         for component in part if getattr(source, "complex", True) else part[:1]:
-            count_levels(np.ascontiguousarray(component), self._counts)
-        if at + self._length > iq.shape[1]:
-            return None
-        whole, self._counts = self._counts, np.zeros(256, np.int64)
-        return whole
+            count_levels(component, counts)
+        return counts
 
     def _levels(self, part: np.ndarray) -> np.ndarray:
         if not self._scale:
@@ -79,7 +83,7 @@ class FrontWatch:
         gain_db = getattr(source, "agc_gain_db", None)
         value = None if gain_db is None else gain_db(sample)
         if value is None:
-            self.unavailable = (
+            self.post.unavailable = (
                 "these samples come without a gain trace: it needs a scenario with [front_end.agc]"
             )
             return None

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from monitors.baselines import SignalQuality
 from monitors.fft import FftMonitor
 from monitors.glrt import GlrtMonitor
 from monitors.multichannel_ar import MultichannelAr
@@ -23,12 +24,12 @@ from monitors.short_training import StudentNull
 from monitors.threshold import ParetoNull
 from tracking.correlator_model import Twin
 
-REHEARSALS = 60
+REHEARSALS = 120
 """Trainings that the twin goes through for one threshold."""
 TEST_S = 100.0
 """Quiet time after each training: a fade has to come and go."""
-TAIL = 0.05
-"""Share of the rehearsed values that the tail is fitted to."""
+TAIL = {"FFT": 0.005, "AR": 0.05}
+"""Share of the rehearsed values that the tail is fitted to; the AR monitor gives fewer."""
 WINDOW_STEPS = 5
 """Steps that a window of the AR monitor is moved by its own length in; windows further apart count as independent."""
 CN0_STEP_DB = 2
@@ -46,30 +47,35 @@ def null_of(channel: Any, corr: np.ndarray) -> Any:
     complex64 (n, K), the epochs it was trained on.
     """
     detector = channel.spec.detector
+    rise = 10 ** (channel.spec.noise_rise_db / 10)
     if isinstance(detector, GlrtMonitor):
         bins = _effective_bins(detector, tuple(channel.taps), channel.epoch_s, channel.signal, channel.prn)
-        return GlrtNull(channel.run, bins)
+        return GlrtNull(channel.run, bins, rise)
     if isinstance(detector, FftMonitor | MultichannelAr):
         cn0 = min(max(CN0_STEP_DB * round(channel.cn0_dbhz / CN0_STEP_DB), 20), 70)
         n_train = -(-len(corr) // 50) * 50  # so that channels share what they can
-        return _rehearse(
+        tail = _rehearse(
             detector, tuple(channel.taps), channel.epoch_s, channel.signal, channel.waveform, cn0, n_train,
             channel.spec.expect_multipath,
         )  # fmt: skip
-    return StudentNull.fit(channel.run.values(corr), two_sided=detector.kind == "SQM")
+        return RehearsedNull(tail, math.log(rise) if isinstance(detector, MultichannelAr) else 0.0)
+    if isinstance(detector, SignalQuality):
+        return StudentNull.fit(channel.run.values(corr), two_sided=True)
+    return StudentNull.fit(channel.run.values(corr), rise=channel.spec.noise_rise_db)
 
 
 @dataclass(frozen=True)
 class GlrtNull:
-    """The GLRT's own: ``GlrtRun.threshold``."""
+    """The GLRT's own, ``GlrtRun.threshold``, times the rise of the noise that is allowed for."""
 
     run: Any
     bins: float
+    rise: float
     rule: str = "analytic"
 
     def isf(self, p_fa: float) -> float:
         """Threshold."""
-        return self.run.threshold(p_fa, self.bins)
+        return self.run.threshold(p_fa, self.bins) * self.rise
 
 
 @dataclass(frozen=True)
@@ -80,19 +86,17 @@ class RehearsedNull:
     """
 
     tail: ParetoNull
-
-    @property
-    def rule(self) -> str:
-        """Name of the rule."""
-        return "rehearsed"
+    shift: float = 0.0
+    """Of the statistic, for the rise of the noise that is allowed for."""
+    rule: str = "rehearsed"
 
     def isf(self, p_fa: float) -> float:
         """Threshold."""
         reach = 1.0 / self.tail.n_effective
         if p_fa >= reach:
-            return self.tail.isf(p_fa)
+            return self.tail.isf(p_fa) + self.shift
         mean_excess = self.tail.sigma / (1 - self.tail.xi)
-        return self.tail.isf(reach) + mean_excess * math.log(reach / p_fa)
+        return self.tail.isf(reach) + mean_excess * math.log(reach / p_fa) + self.shift
 
 
 @lru_cache(maxsize=64)
@@ -107,7 +111,7 @@ def _effective_bins(detector: Any, taps: tuple, epoch_s: float, signal: str, prn
 def _rehearse(
     detector: Any, taps: tuple, epoch_s: float, signal: str, waveform: str | None, cn0_dbhz: float, n_train: int,
     multipath: Any,
-) -> RehearsedNull:  # fmt: skip
+) -> ParetoNull:  # fmt: skip
     """Null of a statistic after a training of ``n_train`` epochs: many quiet twins, each trained and then tested."""
     overlap = 1.0
     if isinstance(detector, MultichannelAr):
@@ -127,7 +131,7 @@ def _rehearse(
             run.train(corr[:n_train])
             values.append(run(corr[n_train:])["value"])
     pooled = np.concatenate(values)
-    return RehearsedNull(ParetoNull.fit(pooled, TAIL, n_effective=overlap * len(pooled)))
+    return ParetoNull.fit(pooled, TAIL[detector.kind], n_effective=overlap * len(pooled))
 
 
 @lru_cache(maxsize=1)

@@ -62,6 +62,7 @@ class Post:
         self.rule = self.unavailable = ""
         self.trained_s = math.nan
         self.quiet_s = 0.0
+        self.seen_s = 0.0  # of lock, or of samples
         self.tests: list[np.ndarray] = []
         self._quiet: list[np.ndarray] = []
         self._above: list[np.ndarray] = []
@@ -82,12 +83,14 @@ class Post:
         if self.unavailable:
             return np.empty(0, MONITOR)
         if self.threshold is None:
-            self._quiet.append(x)
-            self.quiet_s += len(x) * self.epoch_s
-            if self.quiet_s >= self.spec.training_s - 0.5 * self.epoch_s:
-                self._train(np.concatenate(self._quiet))
-                self.trained_s = float(ends[-1]) / self.fs_hz
-            return np.empty(0, MONITOR)
+            n = min(len(x), math.ceil((self.spec.training_s - self.quiet_s) / self.epoch_s - 1e-6))
+            self._quiet.append(x[:n])
+            self.quiet_s += n * self.epoch_s
+            if self.quiet_s < self.spec.training_s - 1e-6:
+                return np.empty(0, MONITOR)
+            self._train(np.concatenate(self._quiet))
+            self.trained_s = float(ends[n - 1]) / self.fs_hz
+            return self.take(x[n:], ends[n:]) if n < len(x) else np.empty(0, MONITOR)
         s = self.run(x, ends)
         s["t_s"] = s["sample_index"] / self.fs_hz
         self.tests.append(s["t_s"])
@@ -214,11 +217,11 @@ class Post:
         }
 
     def _wants(self) -> str:
-        where = f"{self.signal} {self.prn}" if self.signal else "the front end"
-        wait = f"{self.spec.settle_s:g} s to settle and " if self.signal else ""
+        wait = f"{self.spec.settle_s:g} s to settle and "
+        of = "lock" if self.signal else "samples"
         return (
-            f"not trained: it needs {wait}{self.spec.training_s:g} s of {where} and had {self.quiet_s:.3g} s; "
-            "lengthen the recording or shorten training_s"
+            f"not trained: it needs {wait}{self.spec.training_s:g} s of {of} and had {self.seen_s:.1f} s; lengthen the "
+            "recording or shorten settle_s and training_s"
         )
 
 
@@ -270,9 +273,11 @@ def report_lines(rows: list[dict[str, Any]], added: list[dict[str, Any]]) -> lis
         )
         for r in (r for r in rows if r["name"] == m["name"]):
             lines += [f"  {where(r)} {text}" for text in _events(r)]
+    idle: dict[tuple[str, str], list[str]] = {}
     for r in rows:
-        if r["threshold"] is None and "alarms" in r and r.get("unavailable") and r["name"]:
-            lines.append(f"{r['name']} {where(r)}: {r['unavailable']}")
+        if r["threshold"] is None and r.get("unavailable"):
+            idle.setdefault((r["name"], r["unavailable"]), []).append(where(r))
+    lines += [f"{name} on {', '.join(channels)}: {why}" for (name, why), channels in idle.items()]
     return lines
 
 
