@@ -6,11 +6,9 @@ trial that is known already is never counted twice. When the campaign is complet
 (HDF5) and the journal is gone.
 """
 
-import concurrent.futures as futures
 import contextlib
 import io
 import json
-import math
 import os
 import struct
 import time
@@ -24,17 +22,16 @@ import numpy as np
 
 from sdr import store, version
 from sdr.campaign import THRESHOLD, TRIAL, Campaign, load
+from sdr.crew import each, hire
 from sdr.jobs import _progress
 from sdr.tally import PointCount, advantages, summarise
 from sdr.trials import evaluate_trials, fit_thresholds, quiet_statistics, warm_up
 
 CHUNK_S = 1.0
 """Chunks of trials last about this long, so that handing them out costs nothing."""
-CONNECT_S = 10.0
 _MAGIC = b"gnssbb campaign journal 1\n"
 _FRAME = struct.Struct("<cQI")
 _MAX_FRAME = 1 << 30
-_RETRIES = 3
 
 RATE = np.dtype(
     [
@@ -99,7 +96,7 @@ def execute(
     begin = time.perf_counter()
     with Results(campaign, path) as results:
         if not results.complete:
-            with _crew(workers, scheduler, path) as crew:
+            with hire(workers, scheduler, path) as crew:
                 _thresholds(campaign, results, crew, quiet)
                 _evaluate(campaign, results, crew, quiet)
             results.write(complete=True)
@@ -349,212 +346,6 @@ def _frames(f: Any, size: int) -> Iterator[tuple[bytes, bytes]]:
         yield kind, payload
 
 
-# -- who computes -------------------------------------------------------------------------------------------------
-
-
-class _Local:
-    """Processes of this machine; a process that dies is replaced and its chunks are computed again."""
-
-    def __init__(self, workers: int, path: Path) -> None:
-        self.workers, self._path, self._deaths = workers, path, 0
-        self._start()
-
-    def _start(self) -> None:
-        import multiprocessing as mp
-
-        # One BLAS thread each: more would quarrel over the cores.
-        for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-            os.environ.setdefault(name, "1")
-        method = "forkserver" if "forkserver" in mp.get_all_start_methods() else "spawn"
-        context = mp.get_context(method)
-        if method == "forkserver":
-            context.set_forkserver_preload(["sdr.trials"])
-        self._pool = futures.ProcessPoolExecutor(
-            self.workers, mp_context=context, initializer=_obey, initargs=(os.getpid(),)
-        )
-
-    def submit(self, function: Callable, *args: Any) -> futures.Future:
-        """A future of ``function(*args)``."""
-        try:
-            return self._pool.submit(function, *args)
-        except futures.BrokenExecutor:
-            self.revive()
-            return self._pool.submit(function, *args)
-
-    def revive(self) -> None:
-        """After a worker died: new processes, or an error if it happens again and again."""
-        self._deaths += 1
-        if self._deaths > _RETRIES:
-            raise OSError(
-                f"worker processes died {self._deaths} times (out of memory?); what was counted stays in "
-                f"'{self._path}', run the command again to go on"
-            )
-        self._pool.shutdown(wait=False, cancel_futures=True)
-        self._start()
-
-    def check(self) -> None:
-        """Nothing to lose here."""
-
-    def close(self, orderly: bool) -> None:
-        """End the processes."""
-        processes = list((getattr(self._pool, "_processes", None) or {}).values())
-        self._pool.shutdown(wait=orderly, cancel_futures=True)
-        if not orderly:
-            for p in processes:
-                p.terminate()
-
-
-def _obey(parent: int) -> None:
-    """Worker's start: interrupts are the parent's business, and without the parent there is no work."""
-    import signal
-    import threading
-
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
-
-    def watch() -> None:
-        while True:
-            time.sleep(1.0)
-            try:
-                os.kill(parent, 0)
-            except OSError:
-                os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
-
-
-class _Cluster:
-    """A Dask scheduler and its workers, which need this package installed."""
-
-    def __init__(self, address: str, path: Path) -> None:
-        try:
-            import distributed
-        except ImportError:
-            raise ImportError(
-                "--scheduler needs the extra 'cluster': pip install gnss-baseband[cluster]"
-            ) from None
-        import logging
-
-        # A lost connection is told in one sentence below, not in their traces.
-        for name in ("distributed", "distributed.client", "distributed.core", "distributed.comm", "tornado"):
-            logging.getLogger(name).setLevel(logging.CRITICAL)
-        logging.getLogger("tornado.application").setLevel(logging.CRITICAL)
-        self.address, self._path = address, path
-        self._threads, self._counted_at = 1, -math.inf
-        try:
-            self._client = distributed.Client(address, timeout=CONNECT_S, set_as_default=False)
-        except (OSError, ValueError, TimeoutError) as err:
-            reason = " ".join(str(err).split())[:200]
-            raise OSError(f"scheduler '{address}' cannot be reached: {reason}") from None
-        self._executor = self._client.get_executor(pure=False, retries=_RETRIES)
-
-    @property
-    def workers(self) -> int:
-        """Threads of all workers now."""
-        if time.monotonic() - self._counted_at > 1.0:
-            try:
-                self._threads = max(1, sum(self._client.nthreads().values()))
-            except (OSError, RuntimeError):
-                raise OSError(self._lost()) from None
-            self._counted_at = time.monotonic()
-        return self._threads
-
-    def submit(self, function: Callable, *args: Any) -> futures.Future:
-        """A future of ``function(*args)``."""
-        self.check()
-        try:
-            return self._executor.submit(function, *args)
-        except (OSError, RuntimeError, ValueError):  # what a client says that has just lost its scheduler
-            raise OSError(self._lost()) from None
-
-    def revive(self) -> None:
-        """A chunk was lost with its workers."""
-        raise OSError(self._lost())
-
-    def check(self) -> None:
-        """Raise when the scheduler has gone."""
-        comm = self._client.scheduler_comm
-        if self._client.status != "running" or comm is None or comm.comm.closed():
-            raise OSError(self._lost())
-
-    def _lost(self) -> str:
-        return (
-            f"the cluster at '{self.address}' was lost; what was counted stays in '{self._path}', run the command "
-            "again to go on"
-        )
-
-    def close(self, orderly: bool) -> None:
-        """Leave the cluster as it was."""
-        with contextlib.suppress(Exception):
-            self._client.close(timeout=2)
-
-
-@contextlib.contextmanager
-def _crew(workers: int | None, scheduler: str | None, path: Path) -> Iterator[Any]:
-    if scheduler is not None and workers is not None:
-        raise ValueError("--workers counts local processes; with --scheduler the cluster has its own")
-    if workers is not None and not 1 <= workers <= 1024:
-        raise ValueError(f"--workers {workers}: give 1 to 1024")
-    own = (
-        workers or len(os.sched_getaffinity(0))
-        if hasattr(os, "sched_getaffinity")
-        else workers or os.cpu_count() or 1
-    )
-    crew: Any = _Cluster(scheduler, path) if scheduler is not None else _Local(own, path)
-    try:
-        yield crew
-    except BaseException:
-        crew.close(False)
-        raise
-    crew.close(True)
-
-
-def _each(
-    crew: Any, tasks: Iterator[tuple[Any, Callable, tuple]], ahead: Callable[[], int]
-) -> Iterator[tuple[Any, Any]]:
-    """Results (key, value) as they come, with at most ``ahead()`` tasks out at a time."""
-    out: dict[futures.Future, tuple[Any, Callable, tuple]] = {}
-    more = True
-    try:
-        while True:
-            while more and len(out) < ahead():
-                task = next(tasks, None)
-                more = task is not None
-                if task is not None:
-                    out[crew.submit(task[1], *task[2])] = task
-            if not out:
-                return
-            done, _ = futures.wait(out, timeout=1.0, return_when=futures.FIRST_COMPLETED)
-            crew.check()
-            for f in done:
-                yield from _result(crew, f, out)
-            more = True if done else more
-    finally:
-        for f in out:
-            f.cancel()
-
-
-def _result(crew: Any, f: futures.Future, out: dict) -> Iterator[tuple[Any, Any]]:
-    if f not in out:
-        return
-    task = out[f]
-    try:
-        value = f.result()
-    except (futures.BrokenExecutor, futures.CancelledError):
-        lost = list(out.values())
-        out.clear()
-        crew.revive()
-        for again in lost:
-            out[crew.submit(again[1], *again[2])] = again
-        return
-    except Exception as err:
-        if type(err).__module__.startswith("distributed") or isinstance(err, ConnectionError):
-            crew.revive()
-        raise
-    del out[f]
-    yield task[0], value
-
-
 # -- the two stages -----------------------------------------------------------------------------------------------
 
 
@@ -579,7 +370,7 @@ def _thresholds(campaign: Any, results: Results, crew: Any, quiet: bool) -> None
     )
     with _progress(f"{campaign.spec.name}: thresholds", n * len(missing), quiet) as advance:
         done = 0
-        for (g, first), part in _each(crew, tasks, lambda: 2 * crew.workers):
+        for (g, first), part in each(crew, tasks, lambda: 2 * crew.workers):
             values[g][first : first + len(part)] = part
             done += len(part)
             if all(v is not None for v in values[g]):
@@ -642,7 +433,7 @@ def _evaluate(campaign: Campaign, results: Results, crew: Any, quiet: bool) -> N
     planner = _Planner(campaign, results, crew)
     total = sum(c.max_trials for c in results.counts)
     with _progress(campaign.spec.name, total, quiet) as advance:
-        for (_, size), (rows, elapsed_s) in _each(crew, planner, lambda: 2 * crew.workers):
+        for (_, size), (rows, elapsed_s) in each(crew, planner, lambda: 2 * crew.workers):
             planner.trial_s = max(elapsed_s / size, 1e-6)
             results.keep(rows)
             finished = sum(c.reason is not None for c in results.counts)

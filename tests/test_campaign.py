@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from monitors.detection import clopper_pearson
-from sdr import campaign, farm, store, tally, trials
+from sdr import campaign, crew, farm, store, tally, trials
 from sdr.campaign import THRESHOLD, TRIAL, from_table
 from sdr.tally import PointCount
 from sdr.trials import evaluate_trials, quiet_statistics
@@ -354,7 +354,7 @@ def test_two_at_once_on_one_file_are_refused(reference, tmp_path):
 def test_a_scheduler_that_is_not_there(reference, tmp_path, monkeypatch):
     pytest.importorskip("distributed")
     file, _, _ = reference
-    monkeypatch.setattr(farm, "CONNECT_S", 1.0)
+    monkeypatch.setattr(crew, "CONNECT_S", 1.0)
     with pytest.raises(OSError, match=r"scheduler 'tcp://127\.0\.0\.1:9' cannot be reached"):
         farm.run(file, output=tmp_path / "x.h5", scheduler="tcp://127.0.0.1:9", quiet=True)
 
