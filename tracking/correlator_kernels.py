@@ -28,6 +28,7 @@ from tracking.vector_ir import (
 __all__ = ["carrier_table", "correlate_period", "scratch"]
 
 _BLOCK = 1024
+_ROW = _BLOCK + 32  # two rows 4096 bytes apart would hinder each other in the cache
 _FAST = {"reassoc", "contract", "nsz", "arcp"}
 _TWO_PI = 2.0 * math.pi
 _F = np.float32
@@ -39,9 +40,9 @@ def scratch(n_columns):
     """Work arrays for up to ``n_columns`` sums: carrier as float32 and int16, wiped samples, block starts and sums."""
     wide = 2 * n_columns + 16
     return (
-        np.empty((2, _BLOCK), np.float32),
-        np.empty((2, _BLOCK), np.int16),
-        np.empty((2, _BLOCK), np.float32),
+        np.empty((2, _ROW), np.float32),
+        np.empty((2, _ROW), np.int16),
+        np.empty((2, _ROW), np.float32),
         np.zeros(n_columns + 8, np.uint64),
         np.zeros(wide, np.int32),
         np.zeros(wide, np.float32),
@@ -218,8 +219,8 @@ def correlate_period(st, integer, xi, xq, a0, n, theta, step, rate, pool, tap_q,
         if integer:
             done = nb // WIDTH * WIDTH
             _integer_block(
-                x + a, y + a, c_at, c_at + 2 * _BLOCK, pool.ctypes.data, starts.ctypes.data, nb // WIDTH, n_sums,
-                u_at, u_at + 4 * _BLOCK, whole.ctypes.data,
+                x + a, y + a, c_at, c_at + 2 * _ROW, pool.ctypes.data, starts.ctypes.data, nb // WIDTH, n_sums,
+                u_at, u_at + 4 * _ROW, whole.ctypes.data,
             )  # fmt: skip
             _turn_and_add(whole, n_sums, c / INTEGER_SCALE, s / INTEGER_SCALE, sums)
         if done < nb:
