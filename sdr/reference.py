@@ -276,6 +276,7 @@ def results_lines() -> Iterator[str]:
         ("monitors/<name>", sdr.watch_post, "MONITOR"),
         ("monitors/thresholds", sdr.watch_post, "WATCHED"),
         ("monitors/alarms", monitors.records, "ALARM"),
+        ("monitors/unwatched", sdr.watch_post, "UNWATCHED"),
         ("monitors/<integrity monitor>", sdr.findings, "INTEGRITY"),
         ("monitors/protection", sdr.findings, "PROTECTION"),
         ("monitors/response", sdr.respond, "RESPONSE"),

@@ -281,7 +281,7 @@ def test_a_jammed_approach(tmp_path):
     """The built-in approach to its end, every monitor on 8 channels."""
     result = jobs.run("demo-approach", output=tmp_path / "a.h5", quiet=True, plots=True)
     assert len(result["satellites"]) >= 8
-    check_approach(result, 20, 45.0)
+    check_approach(result, 20, 45.0, silent=("sqm-delta",))  # 45 kHz off the carrier E and L are alike
     assert {"monitors.png", "alarms.png"} <= {path.rsplit("/", 1)[1] for path in result["figures"]}
     with h5py.File(tmp_path / "a.h5") as h5:
         assert "monitors/glrt" in h5 and "monitors/agc" in h5 and "monitors/thresholds" in h5
