@@ -265,3 +265,18 @@ def test_order_at_55_db_and_the_coast(accepted):
 def test_scalar_loops_go_where_the_note_says(accepted):
     assert np.mean(accepted["J/S 30 dB scalar"]["n_lost"] >= 4) < 0.5
     assert np.all(accepted["J/S 0 dB scalar"]["n_lost"] == 0)
+
+
+@pytest.mark.slow
+def test_one_run_on_samples(monkeypatch):
+    monkeypatch.setattr(karaim, "SAMPLES_JAM_S", (45.0, 49.0))
+    monkeypatch.setattr(karaim, "SAMPLES_S", 54.0)
+    case = next(c for c in karaim.samples_cases(0) if "45 dB" in c.name)
+    part = karaim.samples_part(case)
+    r = {x["mode"].decode(): x for x in part["receivers"]}
+    assert list(r) == list(MODES) and set(part) == {"receivers", *MODES}
+    assert r["ultra_tight"]["n_satellites"] == 8 and r["ultra_tight"]["n_lost"] == 0
+    assert r["ultra_tight"]["rms_jam_2d_m"] < 3.0 and r["ultra_tight"]["recovered_s"] < 1.0
+    assert r["scalar"]["n_lost"] >= 4
+    rows = karaim_report._samples_rows({case: part}, [case])
+    assert len(rows) == 3 and "satellites lost" in rows[0]["note"]
