@@ -181,8 +181,9 @@ def _read_sigmf(meta: Path) -> Declaration:
     if head.get("core:num_channels", 1) != 1:
         raise ValueError(f"'{meta}' declares several channels; write each channel to a file of its own")
     first = captures[0] if captures else {}
+    # A capture that leaves the centre out keeps it.
     centres = {
-        c.get("core:frequency") for c in captures if not isinstance(c.get("core:frequency"), list | dict)
+        f for c in captures if (f := c.get("core:frequency")) is not None and not isinstance(f, list | dict)
     }
     if len(centres) > 1:
         raise ValueError(f"'{meta}' changes its centre frequency between captures; split it into files")

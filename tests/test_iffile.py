@@ -372,3 +372,9 @@ def test_real_capture():
     iq = source.read(10_000)[1]
     raw = np.fromfile(path, np.int8, 20_000).reshape(-1, 2).T
     np.testing.assert_array_equal(iq, raw * np.array([[1], [-1]], np.int8))
+
+
+def test_sigmf_captures_that_leave_the_centre_out_keep_it(tmp_path):
+    captures = [*GOOD_META["captures"], {"core:sample_start": 1000}]
+    (tmp_path / "a.sigmf-meta").write_text(json.dumps({**GOOD_META, "captures": captures}))
+    assert declaration(tmp_path / "a.sigmf-meta").if_hz == 0.0
