@@ -10,7 +10,18 @@ from sdr import iffile, scenario
 from signals.clock import ClockSpec
 from signals.constants import F_L1_HZ
 from signals.frontend import FrontEndSpec
-from signals.jammers import CW, Chirp, Interferer, MatchedSpectrum, Narrowband, Pulsed, Wideband, finer
+from signals.jammers import (
+    CW,
+    Chirp,
+    Envelope,
+    Interferer,
+    MatchedSpectrum,
+    Narrowband,
+    Pulsed,
+    Wideband,
+    _Jammer,
+    finer,
+)
 from signals.modulation import code_lines, code_table
 from signals.multipath import Echo, Echoes
 from signals.sky import ScriptedSpec, SkySpec
@@ -413,3 +424,27 @@ def test_bad_multipath_is_refused():
     ):
         with pytest.raises(ValueError, match=words):
             scenario.source(scenario.parse(f"{BASE}[multipath]\n{text}\n"))
+
+
+def test_a_new_jammer_is_one_class():
+    """An envelope of the absolute sample index; carrier, power, times and profile come with it."""
+
+    class Ringing(_Jammer):
+        kind: str = "Ringing"
+
+        def envelope(self, fs_hz, seed, context):
+            def samples(n0, n):
+                x = np.sqrt(2) * np.cos(2 * np.pi * 1e4 / fs_hz * np.arange(n0, n0 + n))
+                return np.stack([x, 0 * x]).astype(np.float32)
+
+            return Envelope(samples=samples)
+
+    run, z = make(Ringing(freq_hz=1e5, phase_rad=0.0, start_s=0.001, **JN0), 100_000)
+    t = np.arange(100_000) / FS_HZ
+    wanted = np.sqrt(2) * np.cos(2 * np.pi * 1e4 * t) * np.exp(2j * np.pi * 1e5 * (t - 0.001)) * (t >= 0.001)
+    np.testing.assert_allclose(z / run.amplitude, wanted, atol=2e-4)
+    assert run.rms == pytest.approx(run.amplitude * math.sqrt(0.5 * 0.96), rel=1e-9)
+    spec = FrontEndSpec(fs_hz=FS_HZ, bits=32)
+    sky = static_sky(0.02)
+    clean, both = (SyntheticSource(sky, spec, 0.02, 1, j).read(80_000)[1] for j in ((), [run]))
+    np.testing.assert_allclose((both - clean)[0], z.real[:80_000], atol=1e-4 * run.amplitude + 1e-5)
