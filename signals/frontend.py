@@ -125,7 +125,8 @@ class FrontEndSpec(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     fs_hz: float = Field(default=4.096e6, gt=0.0, le=200e6)
-    """Sample rate."""
+    """Sample rate. Whole samples per chip let a code of little Doppler rest between them, where no receiver sees it
+    move: at 2.046 MHz positions err by 50 to 70 m, at 4 to 16 samples per chip by 1 to 4 m; 2.048 MHz does not."""
     if_hz: float = Field(default=0.0, ge=-100e6, le=100e6)
     """Intermediate frequency."""
     complex: bool = True
