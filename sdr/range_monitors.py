@@ -2,7 +2,7 @@
 
 All use the receiver's noise as it stands and judge excluded satellites too. Two satellites whose rows of the parity weight
 are alike, rho = W_ij / sqrt(W_ii W_jj), explain a fault almost equally well: whoever is accused, the others that the last
-``MEMORY`` epochs leave possible are named beside it, and are left out with it where exclusion is asked for.
+``RECENT`` epochs leave possible are named beside it, and are left out with it where exclusion is asked for.
 """
 
 import math
@@ -18,8 +18,10 @@ from nav.navlog import NavigatorLog
 from sdr.findings import PROTECTION, Alarms, found
 from sdr.respond import Response
 
-MEMORY = 50
-"""Epochs over which the onset of an identified bias is looked for, and rivals are weighed."""
+MEMORY = 200
+"""Epochs over which the onset of an identified bias is looked for: 40 s at 5 Hz."""
+RECENT = 50
+"""Epochs over which rivals are weighed."""
 ODDS = 99.0
 """A satellite is no rival once its own fault would be this much less likely."""
 
@@ -30,7 +32,7 @@ class RangeMonitors:
     def __init__(self, spec, response: Response, alarms: dict[str, Alarms]) -> None:
         self.spec, self.response, self.alarms = spec, response, alarms
         self._bank: BiasTracker | None = None if spec.bias_bank is None else BiasTracker(spec.bias_bank)
-        self._past: list[tuple[list[str], np.ndarray, np.ndarray, np.ndarray]] = []
+        self._past: list[tuple[list[str], np.ndarray, np.ndarray, np.ndarray, dict[str, float]]] = []
         self._new_bias: dict[str, float] = {}
         self._next_level_s = 0.0
 
@@ -45,7 +47,7 @@ class RangeMonitors:
         var = self.response.variance(snap.names, snap.own_m2)
         shift = self.response.shifts(snap.names)
         h = np.column_stack([-snap.los, np.ones(len(snap.names)), snap.second])
-        self._past.append((snap.names, snap.residual_m + shift, h, var))
+        self._past.append((snap.names, snap.residual_m + shift, h, var, dict(self.response.shift)))
         del self._past[:-MEMORY]
         self._raim(snap, h, var, sample, t_s, out)
         self._biases(snap.names, snap.residual_m + shift, h, var, sample, t_s, out)
@@ -108,7 +110,7 @@ class RangeMonitors:
     def _scores(self, epochs: int) -> list[tuple[list[str], np.ndarray, np.ndarray]]:
         """(names, W r, diagonal of W) of the last epochs; zero where the parity says nothing."""
         out = []
-        for names, raw, h, var in self._past[-epochs:]:
+        for names, raw, h, var, _ in self._past[-epochs:]:
             try:
                 w, _ = parity_weight(h, var)
                 out.append((names, w @ raw, np.diag(w)))
@@ -125,12 +127,13 @@ class RangeMonitors:
         names = self._past[-1][0]
         if name not in names:
             return []
-        wr, w = np.zeros((2, len(self._past), len(names)))
-        for k, (then, a, b) in enumerate(self._scores(MEMORY)):
+        scores = self._scores(RECENT)
+        wr, w = np.zeros((2, len(scores), len(names)))
+        for k, (then, a, b) in enumerate(scores):
             at = [then.index(n) if n in then else -1 for n in names]
             wr[k], w[k] = np.append(a, 0.0)[at], np.append(b, 0.0)[at]
         best = np.zeros(len(names))
-        for first in range(0, len(self._past), 4):
+        for first in range(0, len(scores), 4):
             for shape in (np.ones(len(wr) - first), np.arange(1.0, len(wr) - first + 1)):
                 size = np.maximum(shape**2 @ w[first:], 1e-12)
                 best = np.maximum(best, (shape @ wr[first:]) ** 2 / size)
@@ -154,13 +157,13 @@ class RangeMonitors:
         if self.response.spec.bias:
             before = self.response.shift
             self.response.shift = self._bank.correction(report)
-            self._new_bias = {n: b for n, b in self.response.shift.items() if not before}
+            self._new_bias = {n: b for n, b in self.response.shift.items() if b != before.get(n, 0.0)}
 
     def undo(self, log: NavigatorLog | NormalPoints | None) -> np.ndarray | None:
         """What a bias that was just identified has done to the filter's state since its onset, with the sign reversed.
 
         Onset by cumulative sum: the epoch from which the log-likelihood ratio to now, sum of mu (W r)_i - mu^2 W_ii / 2,
-        is largest. The state it polluted follows c <- (I - K H) phi c + K_i mu.
+        is largest. The state it polluted follows c <- (I - K H) phi c + K_i (mu - what was taken off, or undone, already).
         """
         if not self._new_bias or log is None or log.count == 0:
             return None
@@ -174,9 +177,10 @@ class RangeMonitors:
         age = 1 + int(np.argmax(np.cumsum(ratio)))
         part, row = log.log(age), log.names.index(name)
         c = np.zeros(log.dx.size)
-        for e in range(age):
+        for e, (*_, taken) in enumerate(self._past[-age:]):
+            left, taken[name] = mu - taken.get(name, 0.0), mu
             c = part.phi[e] @ c if e else c
-            c = c + part.k[e] @ ((np.arange(part.r.shape[1]) == row) * mu * part.used[e] - part.h[e] @ c)
+            c = c + part.k[e] @ ((np.arange(part.r.shape[1]) == row) * left * part.used[e] - part.h[e] @ c)
         return -c
 
     # -- protection levels --------------------------------------------------------------------------------------------

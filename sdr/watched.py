@@ -84,7 +84,7 @@ class SteeringWatch:
         f = steering.filter
         clock, drift = kernels.clock_states(f.code)
         self.steering, self.filter, self.slots = steering, f, SLOTS
-        self.points = NormalPoints(f.p.shape[0], SLOTS, clock, drift)
+        self.points = NormalPoints(f.p.shape[0], SLOTS, clock, drift, length)
         self._gain = np.repeat(np.array([clock, drift]), SLOTS)
         self._single: deque[np.ndarray] = deque(maxlen=length)
         self.fresh, self._ready = 0, False

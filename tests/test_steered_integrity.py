@@ -175,7 +175,7 @@ def test_rivals_are_named_until_the_fault_tells_them_apart():
         for k in range(20):
             raw = np.random.default_rng(k).standard_normal(7)
             raw[0] += size * (k >= 19)
-            ranges._past.append((names, raw, h, ones))
+            ranges._past.append((names, raw, h, ones, {}))
         got[size] = ranges.rivals("G01")
     assert got[40.0] == [] and "G02" in got[4.0]
 
