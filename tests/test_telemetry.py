@@ -1,15 +1,19 @@
 """Symbols from the tracking kernel through the decoders to transmit times; a real capture."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from tracking_signal import Satellite, slab, track
 
+from sdr import receiver
+from sdr.scenario import ReceiverSpec
 from signals import inav, lnav
 from signals.modulation import SIGNALS
 from signals.orbits import nominal_constellation
 from tracking.channel import STATE_LOCKED, TrackingSpec
+from tracking.kernels import CHANNEL, SYMBOL
 from tracking.telemetry import Telemetry
 
 WEEK, TOW_S = 2300, 345_600
@@ -106,3 +110,53 @@ def test_a_real_capture_is_tracked():
         soft = -np.sign(tracker.symbols[c, : tracker.symbol_counts[c]]["soft"])
         found += np.any(np.correlate(soft, sync, "valid") == 10)
     assert found == np.count_nonzero(tracker.channels["signal"] == b"E1C") == 7
+
+
+class _Channels:
+    """What telemetry reads of a tracker: one C/A channel whose symbols are set by hand."""
+
+    def __init__(self):
+        self.channels = np.zeros(1, CHANNEL)
+        self.channels["signal"], self.channels["prn"], self.channels["state"] = b"L1CA", 7, STATE_LOCKED
+        self.channels["symbol_phase"] = 3
+
+    def bring(self, bits, first):
+        self.symbols, self.symbol_counts = np.zeros((1, len(bits)), SYMBOL), np.array([len(bits)])
+        self.symbols[0]["soft"] = bits
+        self.symbols[0]["code_period"] = 3 + 20 * (first + np.arange(len(bits)))
+
+
+def test_slabs_decoded_together_say_the_same():
+    """Also across a hole in the bits, which begins a new run."""
+    bits = transmitted("L1CA", 7, 2400)
+    bits = np.delete(bits, np.arange(700, 707))
+    first = np.where(np.arange(len(bits)) < 700, np.arange(len(bits)), np.arange(len(bits)) + 7)
+    said = []
+    for together in (1, 7):
+        telemetry, events = Telemetry(_Channels()), []
+        telemetry.start(0)
+        for k, at in enumerate(range(0, 2390, 10)):
+            telemetry.tracker.bring(bits[at : at + 10], first[at])
+            telemetry.hear()
+            if k % together == together - 1:
+                events += telemetry.decode()
+        events += telemetry.decode()
+        said.append((events, telemetry.reference(0), telemetry.ephemerides().tobytes()))
+    assert len(said[0][0]) >= 5 and said[0][1][1] >= 0
+    assert said[0] == said[1]
+
+
+def test_the_second_search_takes_the_lost_and_the_nearest():
+    """Those lost a moment ago first, then the ``SECOND_LOOK`` that came nearest their thresholds; all while too few."""
+    spec = ReceiverSpec.model_validate({"acquisition": {"systems": ["G"]}})
+    source = SimpleNamespace(fs_hz=4e6, if_hz=0.0, n_samples=4 * 10**8)
+    run = receiver.Receiver(spec, source)
+    run._nearness = {("L1CA", p): p / 100 for p in range(1, 33)}
+    assert [p for _, p in run._due(0)] == list(range(1, 33))
+    run.channel_of = {("L1CA", p): p for p in (31, 32, 30, 29)}
+    run._lost = [("L1CA", 2)]
+    n = run._next_search
+    assert [p for _, p in run._due(n)] == [2, 28, 27, 26, 25, 24, 23, 22, 21][: 1 + receiver.SECOND_LOOK]
+    assert len(run._due(run._next_search)) == 1
+    run.channel_of.popitem()
+    assert len(run._due(run._next_search)) == 29
