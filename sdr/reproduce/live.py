@@ -42,7 +42,8 @@ class Twin:
     filter believes, ``sigma_m`` the true one, scalars or (N,).
     """
 
-    heed, weaken = Steering.heed, Steering.weaken  # the answers as they are taken on samples
+    heed: Any = Steering.heed  # the answers as they are taken on samples
+    weaken: Any = Steering.weaken
 
     def __init__(self, sigma_m=5.0, claimed_m=5.0, seed=1):
         self.rng, self.sigma_m, self.fs_hz, self.epoch = np.random.default_rng(seed), sigma_m, FS_HZ, 0
@@ -108,7 +109,8 @@ def fly(monitors, respond=None, seconds=30.0, sigma_m=5.0, fault=None, seed=1, c
 
     ``monitors``: keys of ``[receiver.integrity]`` or None; ``respond``: of ``[receiver.respond]``; ``fault(t_s)`` -> (N,) m.
     """
-    sky, run = Twin(sigma_m, claimed_m, seed), None
+    sky: Any = Twin(sigma_m, claimed_m, seed)
+    run = None
     if monitors is not None:
         run = IntegritySpec.model_validate(monitors).start(RespondSpec.model_validate(respond or {}), FS_HZ)
     track = np.empty((3, round(seconds / T_S)))
