@@ -121,8 +121,8 @@ class Steering:
             ]
         )
         if spec.code_noise_m is not None:
-            # Of the true range: what a discriminator of lower gain shows is smaller.
-            self._tables[:, :, 1] = (self._tables[:, :, 0] * spec.code_noise_m / METRES_PER_CHIP) ** 2
+            # Of the discriminator, whatever its gain: an estimate of C/N0 that dips must not make it small.
+            self._tables[:, :, 1] = (spec.code_noise_m / METRES_PER_CHIP) ** 2
         self.log_length = 256
         self.state, self.reason, self.filter = SCALAR, "waiting for a scalar fix", None
         self.record = np.zeros(1, STEERING)
