@@ -51,7 +51,7 @@ REPORT_S = 0.1
 REFRESH_S = 1.0
 """Atmosphere and ephemerides are renewed this often."""
 MISSING_S = 5.0
-"""A vector receiver that misses more satellites than it hears for this long lets go: its replicas are elsewhere."""
+"""A vector receiver that misses as many satellites as it hears for this long lets go: its replicas are elsewhere."""
 INCONSISTENT_RATIO = 2.5
 """Mean of the normalised innovations squared (none above ``kernels.SURPRISE``) through a second, beyond which the filter is
 not believed: sensors of another unit, frame or start. It stays below 1.2 through a jam and an outage."""
@@ -428,7 +428,7 @@ class Steering:
             f.code, f.x, f.p, f.los, self.active, f.power, f.cn0, USABLE_CN0_HZ, sigma
         )
         self.sigma, self.usable = sigma, usable
-        self._missing_s = self._missing_s + 1.0 / self.spec.update_hz if missing > heard > 0 else 0.0
+        self._missing_s = self._missing_s + 1.0 / self.spec.update_hz if missing >= heard > 0 else 0.0
         if usable >= 1:
             self.state, self._coast_since = STEERED, -1
         else:
