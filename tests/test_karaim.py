@@ -139,7 +139,7 @@ def test_no_line_inside_is_no_interference():
 def _made_up(n_runs=50):
     """Runs whose errors are the published ones times a factor per run that straddles one."""
     cases, runs = karaim.twin_cases(WHOLE._replace(n_runs=n_runs)), {}
-    factor = np.linspace(0.5, 2.0, n_runs)
+    factor = np.geomspace(0.5, 2.0, n_runs)
     for case in cases:
         r = np.zeros(n_runs, RUN)
         for kind, key in (("RMS", "rms"), ("MAX", "max")):
