@@ -149,7 +149,7 @@ class Telemetry:
         LNAV does not say whose it is: all but one of a group are another's signal, found through the cross-correlation
         of the codes. I/NAV names its satellite, and the decoder minds it.
         """
-        groups = {}
+        groups: dict = {}
         for key, d in self.decoders.items():
             if key[0] == "G" and d.ephemeris is not None:
                 groups.setdefault(tuple(d.ephemeris[list(_ORBIT)].item()), []).append(key)
