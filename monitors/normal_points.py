@@ -2,11 +2,12 @@
 
 An ultra-tight filter is updated fifty times a second with ranges whose noise is ten times that of a fifth of a second's
 mean. Monitors of ranges lose nothing by the mean. Over the window from one normal point to the next the filter's own
-corrections are taken back, m <- phi m, z'_k = z_k + H_k m, m <- m + dx, so that
+corrections are taken back, m <- phi m, z'_k = z_k + H_k m, m <- m + dx, so that, with weights w_k = g_k^2 / R_k,
 
-    mean(z'_k / g_k) = H eps + mean(v_k / g_k),   eps ~ N(0, phi P phi' + Qd),   R = sum(R_k / g_k^2) / N^2
+    sum(w_k z'_k / g_k) / sum(w_k) = H eps + noise,   eps ~ N(0, phi P phi' + Qd),   R = 1 / sum(w_k)
 
-with P the covariance at the window's start and g the discriminators' gains, which the filter's rows carry.
+with P the covariance at the window's start and g the discriminators' gains, which the filter's rows carry. In deep noise a
+gain comes near zero now and then: that epoch tells nothing, and z / g of it is kilometres.
 """
 
 import numpy as np
@@ -18,12 +19,12 @@ from nav.navlog import EXCLUDED_M2
 
 
 @njit(cache=True, nogil=True)
-def gather(phi, qd, h, z, own, dx, gain, total_phi, total_qd, moved, row, mean, var, count):
+def gather(phi, qd, h, z, own, dx, gain, total_phi, total_qd, moved, row, mean, info, count):
     """One epoch of the filter into the window's sums, in place.
 
     ``h`` (m, n), ``z``, ``own`` (m,) the receiver's own variances, 0 where there was nothing; ``gain`` (m,) the column of
     each row's clock; ``total_*``, ``moved`` (n,): transition, process noise and corrections since the window began;
-    ``row`` (m, n) newest row of unit gain; ``mean``, ``var``, ``count`` (m,): sums of z'/g, own/g^2 and epochs.
+    ``row`` (m, n) newest row of unit gain; ``mean``, ``info``, ``count`` (m,): sums of w z'/g, of w = g^2/own, and of epochs.
     """
     eskf_kernels.chain(total_phi, total_qd, phi, qd)
     moved[:] = np.dot(phi, moved)
@@ -35,8 +36,8 @@ def gather(phi, qd, h, z, own, dx, gain, total_phi, total_qd, moved, row, mean, 
         for j in range(moved.size):
             value += h[i, j] * moved[j]
             row[i, j] = h[i, j] / g
-        mean[i] += value / g
-        var[i] += own[i] / (g * g)
+        mean[i] += value * g / own[i]
+        info[i] += g * g / own[i]
         count[i] += 1
     for j in range(moved.size):
         moved[j] += dx[j]
@@ -64,13 +65,13 @@ class NormalPoints:
     def _open(self) -> None:
         n, m = self.dx.size, self.z.size
         self._phi, self._qd, self._moved = np.eye(n), np.zeros((n, n)), np.zeros(n)
-        self._row, self._mean, self._var = np.zeros((m, n)), np.zeros(m), np.zeros(m)
+        self._row, self._mean, self._info = np.zeros((m, n)), np.zeros(m), np.zeros(m)
         self._n = np.zeros(m, np.int64)
 
     def add(self, phi, qd, h, z, own, dx) -> None:
         """One epoch of the filter."""
         gather(
-            phi, qd, h, z, own, dx, self._gain, self._phi, self._qd, self._moved, self._row, self._mean, self._var,
+            phi, qd, h, z, own, dx, self._gain, self._phi, self._qd, self._moved, self._row, self._mean, self._info,
             self._n,
         )  # fmt: skip
 
@@ -83,11 +84,11 @@ class NormalPoints:
         # A slot that changed hands within the window holds two satellites' ranges.
         kept = np.tile([a == b for a, b in zip(names, self.names)], 2)
         seen = (self._n > 0) & kept
-        n = np.maximum(self._n, 1)
-        self.names, self.seen, self.epochs = list(names), seen, int(n.max())
-        self.z, self.own = np.where(seen, self._mean / n, 0.0), np.where(seen, self._var / n**2, 1.0)
+        info = np.where(seen, self._info, 1.0)
+        self.names, self.seen, self.epochs = list(names), seen, int(max(self._n.max(), 1))
+        self.z, self.own = np.where(seen, self._mean / info, 0.0), 1.0 / info
         self.h, self.dx = np.where(seen[:, None], self._row, 0.0), self._moved
-        self.single = np.where(seen, self._var / n, np.nan)
+        self.single = np.where(seen, self._n / info, np.nan)
         phi, qd = self._phi, self._qd
         self._open()
         if first is None:

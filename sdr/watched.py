@@ -132,12 +132,18 @@ class SteeringWatch:
         return self.filter.p
 
     def innovations(self, n: int) -> EpochLog:
-        """The last n epochs of the filter itself, rows of unit gain, ``s`` empty; without excluded rows."""
+        """The last n epochs of the filter itself, rows of unit gain, ``s`` empty; without excluded rows.
+
+        ALS seeks one variance per row: epochs of less than half the row's usual gain, whose unit-gain noise is at least
+        four times the usual, are not looked at (they stay in the filter's gains).
+        """
         log = self.filter.log(n)
         e = np.arange(SLOTS * 2)
         g = log.h[:, e, self._gain]
-        used = log.used & (g > 0) & (log.var < 0.5 * EXCLUDED_M2)
-        g = np.where(used, g, 1.0)
+        told = log.used & (g > 0) & (log.var < 0.5 * EXCLUDED_M2)
+        usual = np.array([np.median(x[t]) if t.any() else 0.0 for x, t in zip(g.T, told.T)])
+        used = told & (g > 0.5 * usual)
+        g = np.where(told, g, 1.0)
         return log._replace(
             h=log.h / g[:, :, None], k=log.k * g[:, None, :], r=log.r / g, var=log.var / g**2, used=used
         )

@@ -108,11 +108,16 @@ def test_bad_input_is_one_sentence(args, words, noise, tmp_path):
         assert word in done.stderr, done.stderr
 
 
+def _hear_interrupts():
+    """A shell gives its background jobs an ignored SIGINT, which the tests below would inherit."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
 def _begin(tmp_path, *args):
     out = tmp_path / "long.h5"
     process = subprocess.Popen(
         [*GNSSBB, "run", "demo", "-o", str(out), "--set", "duration_s=3000", *args],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=_hear_interrupts,
     )  # fmt: skip
     for _ in range(600):
         time.sleep(0.2)
@@ -170,6 +175,7 @@ def test_an_interrupt_in_a_destructor_is_not_lost(monkeypatch):
             raise KeyboardInterrupt
 
     monkeypatch.setattr(sys, "unraisablehook", command_line._interrupt_again)
+    _hear_interrupts()
     with pytest.raises(KeyboardInterrupt):
         Dying()
         time.sleep(10)

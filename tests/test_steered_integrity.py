@@ -46,8 +46,8 @@ def one(satellite, size):
 # ------------------------------------------------------------------------------------------------------ normal points
 
 
-def test_a_normal_point_is_the_mean_of_noise_and_the_error_at_the_windows_start():
-    """Whatever the filter corrected within the window: without dynamics, z' = H eps_0 + mean v exactly, gains divided out."""
+def test_a_normal_point_is_the_weighted_noise_and_the_error_at_the_windows_start():
+    """Whatever the filter corrected within the window: without dynamics, z' = H eps_0 + weighted mean of v / g exactly."""
     rng = np.random.default_rng(5)
     n, slots, clock, drift = 4, 6, 2, 3
     points = NormalPoints(n, slots, clock, drift)
@@ -70,8 +70,10 @@ def test_a_normal_point_is_the_mean_of_noise_and_the_error_at_the_windows_start(
         assert points.close(window * 1.0, names, np.ones(2 * slots), filt.p) == (window > 0)
         if window == 0:
             continue  # the slots got their names just now
-        np.testing.assert_allclose(points.z, h @ start + (v / gain).mean(axis=0), atol=1e-12)
-        np.testing.assert_allclose(points.own, (2.0 / gain**2).mean(axis=0) / 10, rtol=1e-12)
+        info = gain**2 / 2.0
+        noise = np.sum(info * v / gain, axis=0) / info.sum(axis=0)
+        np.testing.assert_allclose(points.z, h @ start + noise, atol=1e-12)
+        np.testing.assert_allclose(points.own, 1.0 / info.sum(axis=0), rtol=1e-12)
         last = points.last()
         np.testing.assert_allclose(last.p, p0 + 1e-2 * np.eye(n), rtol=1e-12)
         np.testing.assert_allclose(start - eps, points.dx, atol=1e-12)
