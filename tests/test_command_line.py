@@ -151,7 +151,7 @@ def test_sigterm_and_ctrl_c_exit_130_with_what_was_computed(tmp_path):
         process, out = _begin(tmp_path)
         process.send_signal(number)
         _, err = process.communicate(timeout=60)
-        assert process.returncode == 130
+        assert process.returncode == 130, err
         assert "Traceback" not in err
         _check(out, False)
         out.unlink()
