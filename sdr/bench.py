@@ -108,8 +108,8 @@ def bench(*, quick: bool = False, quiet: bool = False) -> dict[str, Any]:
     ratio, steered = _steered(rounds)
     say(f"  ultra-tight, 10 ch    {steered:6.1f} times real time, costs {ratio:.2f} scalar receivers")
     shares = {name: _integrity(name) for name in (() if quick else ("integrity-ramp", "integrity-ut-ramp"))}
-    for name, share in shares.items():
-        say(f"  integrity monitors    {100 * share:6.1f} % of the receiver's time ({name})")
+    for name, part in shares.items():
+        say(f"  integrity monitors    {100 * part:6.1f} % of the receiver's time ({name})")
     speedup = _median([_threads() for _ in range(rounds)])
     say(f"  2 threads             {speedup:6.2f} of two independent processes")
     return {
