@@ -138,7 +138,7 @@ class Results:
         except ValueError:
             self._journal.close()
             raise
-        self.resumed = sum(c.done for c in self.counts)
+        self.resumed = sum(c.kept for c in self.counts)
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:

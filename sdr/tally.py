@@ -46,6 +46,11 @@ class PointCount:
         """Trials counted."""
         return len(self.rows)
 
+    @property
+    def kept(self) -> int:
+        """Trials that need not be run again: those counted, and those that wait for an earlier one."""
+        return self.done + len(self._ahead)
+
     def has(self, trial: int) -> bool:
         """Whether a trial's result is here already."""
         return trial < self.done or trial in self._ahead

@@ -193,6 +193,17 @@ def test_killed_again_and_again_it_ends_the_same(reference, tmp_path):
     assert again["points"] == result["points"]
 
 
+def test_a_trial_that_came_before_its_turn_is_kept(reference, tmp_path):
+    """Chunks end in any order: one that a kill left waiting for an earlier one is not run again, nor counted yet."""
+    file, _, expected = reference
+    trials = expected["trials"]
+    later = trials[(trials["point"] == 0) & (trials["trial"] == 1)]
+    with farm.Results(campaign.load(file), tmp_path / "ahead.h5") as begun:
+        begun.keep(later)
+    with farm.Results(campaign.load(file), tmp_path / "ahead.h5") as again:
+        assert again.resumed == 1 and again.counts[0].done == 0 and again.counts[0].has(1)
+
+
 def test_a_worker_that_dies_is_replaced(reference, tmp_path):
     file, _, expected = reference
     out = tmp_path / "died.h5"
