@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from signals.frontend_kernels import control, fir
+from signals.frontend_kernels import control, fir, mix
 from signals.jammer_kernels import add_tone
 from signals.kernels import quantise_bits, quantise_int8, quantise_int16
 from signals.modulation import BLOCK
@@ -65,7 +65,10 @@ class FilterSpec(BaseModel):
         gain = 10 ** (self.ripple_db / 20 * np.cos(u)) * (np.abs(f) <= self.bandwidth_hz / 2)
         phase = -self.group_delay_ripple_s * self.bandwidth_hz / self.ripples * np.sin(u)
         half = self.taps // 2
-        h = np.roll(np.fft.ifft(gain * np.exp(1j * phase)), half)[: self.taps] * np.kaiser(self.taps, 6.0)
+        # Amplitude even and phase odd about the band's middle: real taps there.
+        h = np.roll(np.fft.ifft(gain * np.exp(1j * phase)).real, half)[: self.taps] * np.kaiser(
+            self.taps, 6.0
+        )
         return h * np.exp(2j * math.pi * if_hz / fs_hz * (np.arange(self.taps) - half))
 
 
@@ -199,8 +202,10 @@ class FrontEnd:
         else:
             gain = 1.0 / (OPTIMAL_STEP[spec.bits] * rms)
         self.gain = np.float32(gain)
+        self._delay = (len(taps) - 1) // 2
+        self._skip = self._delay if spec.filter and spec.filter.delay == "removed" else 0
+        taps = np.append(taps, np.zeros(-len(taps) % 4))
         self._taps = taps.real.astype(np.float32), taps.imag.astype(np.float32)
-        self._skip = (len(taps) - 1) // 2 if spec.filter and spec.filter.delay == "removed" else 0
         self._past = np.zeros((2, len(taps) - 1), np.float32)
         self._agc = np.array([gain, 0.0, 0.0])
         self._agc_trace: list[tuple[int, float]] = []
@@ -223,10 +228,10 @@ class FrontEnd:
         return self._quantise(iq, self.gain)
 
     def push(self, iq: np.ndarray, last: bool = False) -> np.ndarray:
-        """The next float32 (2, n) -> the samples that are ready; ``last``: all that are left."""
+        """The next float32 (2, n), which is used up -> the samples that are ready; ``last``: all that are left."""
         imp = self.spec.impairments
         if imp is not None and (imp.lo_offset_hz or imp.phase_noise_rad):
-            iq = self._mix(iq, imp.lo_offset_hz)
+            mix(iq, self._in, imp.lo_offset_hz / self.spec.fs_hz, self._wander(self._in, iq.shape[1]))
         self._in += iq.shape[1]
         if self.spec.filter is not None:
             iq = self._filter(iq, last and self.spec.filter.delay == "removed")
@@ -256,16 +261,9 @@ class FrontEnd:
             out[1] = 0
         return out
 
-    def _mix(self, iq: np.ndarray, lo_offset_hz: float) -> np.ndarray:
-        n = self._in + np.arange(iq.shape[1])
-        turns = np.mod(n * (lo_offset_hz / self.spec.fs_hz), 1.0)
-        z = (iq[0] + 1j * iq[1]) * np.exp(1j * (self._wander(n) - 2 * math.pi * turns))
-        return np.stack([z.real, z.imag]).astype(np.float32)
-
     def _filter(self, iq: np.ndarray, drain: bool) -> np.ndarray:
-        ahead = self._past.shape[1] // 2
         if drain:
-            iq = np.concatenate([iq, np.zeros((2, ahead), np.float32)], axis=1)
+            iq = np.concatenate([iq, np.zeros((2, self._delay), np.float32)], axis=1)
         x = np.concatenate([self._past, iq], axis=1)
         self._past = x[:, x.shape[1] - self._past.shape[1] :].copy()
         out = np.empty((2, iq.shape[1]), np.float32)
@@ -295,16 +293,15 @@ class _Wander:
         self._rng = np.random.default_rng(seed)
         self._first, self._nodes = 0, np.array([self.rms * self._rng.standard_normal()])
 
-    def __call__(self, n: np.ndarray) -> np.ndarray:
-        if self.rms == 0.0 or len(n) == 0:
-            return np.zeros(len(n))
+    def __call__(self, n0: int, n: int) -> np.ndarray:
+        """Phases (rad) at the beginning of the block of sample n0 and of those after it, the one after n0 + n included."""
         nodes = list(self._nodes)
-        while self._first + len(nodes) <= n[-1] // BLOCK + 1:
+        while self._first + len(nodes) <= (n0 + n) // BLOCK + 1:
             draw = self._rng.standard_normal() * self.rms * math.sqrt(1 - self._keep**2)
             nodes.append(self._keep * nodes[-1] + draw)
-        drop = n[0] // BLOCK - self._first
+        drop = n0 // BLOCK - self._first
         self._first, self._nodes = self._first + drop, np.array(nodes[drop:])
-        return np.interp(n / BLOCK - self._first, np.arange(len(self._nodes)), self._nodes)
+        return self._nodes
 
 
 def check_sampling(fs_hz: float, if_hz: float, is_complex: bool) -> None:

@@ -142,6 +142,20 @@ def test_impairments():
     )
 
 
+def test_the_oscillator_turns_every_sample_by_its_phase():
+    """Both components turn alike: a product of two float32 rotations errs by some units of 2^-24 each."""
+    n, cuts = 30_000, [1, 65, 1023, 1024, 5000, 17_001]
+    impairments = {"lo_offset_hz": -12_345.6, "phase_noise_rad": 0.7, "phase_noise_bw_hz": 900.0}
+    iq, one = noise(n), np.stack([np.ones(n), np.zeros(n)]).astype(np.float32)
+    x, turn = (run(part, cuts, bits=32, impairments=impairments).astype(float) for part in (iq, one))
+    wanted = (iq[0] + 1j * iq[1]) * (turn[0] + 1j * turn[1])
+    np.testing.assert_allclose(x[0] + 1j * x[1], wanted, atol=10 * 2**-24 * np.abs(iq).max())
+    steps = np.diff(np.unwrap(np.angle(turn[0] + 1j * turn[1])))
+    mean = 2 * math.pi * 12_345.6 / FS_HZ
+    # A node moves by 0.7 sqrt(2 x 2 pi 900 BLOCK / fs) = 1.2 rad rms, in BLOCK steps; the phase never jumps.
+    assert np.abs(steps - mean).max() < 5 * 1.2 / BLOCK
+
+
 def test_phase_noise_has_its_power_and_corner():
     """First order: autocorrelation rms^2 exp(-2 pi B tau); n_eff = pi B T independent values over T."""
     n, rms, corner_hz = 8_000_000, 0.1, 200.0
