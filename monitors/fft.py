@@ -36,19 +36,21 @@ def to_columns(corr, lo, out):
         out[k, n + m :] = 0.0
 
 
+@njit(nogil=True, fastmath={"contract", "nnan", "nsz"})
+def _sum_and_difference(a, b, total, difference):
+    for e in range(len(a)):
+        i = np.uint64(e)
+        x, y = a[i], b[i]
+        total[i], difference[i] = x + y, x - y
+
+
 @njit(cache=True, nogil=True, fastmath={"contract", "nnan", "nsz"})
 def _fold(z, even, odd):
     """Even and odd part about the centre tap: rows x_0, x_n + x_-n and x_n - x_-n."""
     h = odd.shape[0]
-    n = z.shape[1]
-    for e in range(n):
-        even[0, e] = z[h, e]
+    even[0] = z[h]
     for k in range(h):
-        for e in range(n):
-            a = z[h + 1 + k, e]
-            b = z[h - 1 - k, e]
-            even[k + 1, e] = a + b
-            odd[k, e] = a - b
+        _sum_and_difference(z[h + 1 + k], z[h - 1 - k], even[k + 1], odd[k])
 
 
 @njit(cache=True, nogil=True, fastmath={"contract", "nnan", "nsz"})
@@ -136,13 +138,19 @@ class FftRun:
         self.bin_hz = -CHIP_RATE_HZ / (N * step[0])
         self.n_taps = K
         self.count, self.mean, self._m2 = 0, 0.0, 0.0
+        self.least_spread = 0.0  # of std / mean: a short training may have met too few fades
         self.epoch = 0
         self._buffers(_BLOCK)
 
     @property
+    def spread(self):
+        """Standard deviation of the maximum in training over its mean."""
+        return math.sqrt(self._m2 / (self.count - 1)) / self.mean if self.count > 1 else math.nan
+
+    @property
     def std(self):
-        """Standard deviation of the maximum in training."""
-        return math.sqrt(self._m2 / (self.count - 1)) if self.count > 1 else math.nan
+        """Standard deviation of the maximum that standardises."""
+        return self.mean * max(self.spread, self.least_spread)
 
     def _buffers(self, n):
         h = self.n_taps // 2

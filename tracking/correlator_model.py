@@ -413,25 +413,25 @@ def _near(periods):
     return max(16, math.ceil(_NEAR / periods**2))
 
 
-def _line_vectors(spec, k, taps):
+def _line_vectors(signal, prn, waveform, k, taps):
     """conj(c_k) e^{-2 pi i k d / L}, complex128 (n, K)."""
     k = np.asarray(k)
-    length = SIGNALS[spec.signal].code_length_chips
-    c = np.conj(code_spectrum(spec.signal, spec.prn, k, spec.waveform))
+    length = SIGNALS[signal].code_length_chips
+    c = np.conj(code_spectrum(signal, prn, k, waveform))
     turns = np.mod(k[:, None] * (taps[None, :] / length), 1.0)
     return c[:, None] * np.exp(-2j * np.pi * turns)
 
 
-def _tap_vectors(spec, x, taps):
+def _tap_vectors(signal, prn, waveform, integration_s, x, taps):
     """Taps of a unit CW of frequency x / T whose phase is zero at mid-interval, complex128 (n, K).
 
     sum_k conj(c_k) sinc(x - k N) e^{-2 pi i k (N / 2 + d / L)}, N code periods in T.
     """
-    N = round(spec.integration_s / SIGNALS[spec.signal].code_period_s)
+    N = round(integration_s / SIGNALS[signal].code_period_s)
     near = _near(N)
     k = np.arange(math.floor(x.min() / N) - near, math.ceil(x.max() / N) + near + 1)
     sign = np.where(k * N % 2 == 0, 1.0, -1.0)
-    return (np.sinc(x[:, None] - k * N) * sign) @ _line_vectors(spec, k, taps)
+    return (np.sinc(x[:, None] - k * N) * sign) @ _line_vectors(signal, prn, waveform, k, taps)
 
 
 def _chebyshev(spec, low, high, taps):
@@ -447,11 +447,22 @@ def _chebyshev(spec, low, high, taps):
             f"a jammer sweeps {2 * half:.0f} / T within {BLOCK_EPOCHS} integrations: lower rate_hz_s or "
             "use samples instead of the twin"
         )
+    centre = 0.5 * (low + high)
+    code = spec.signal, spec.prn, spec.waveform
+    return (centre, half), _series(*code, spec.integration_s, centre, half, n, tuple(taps.tolist()))
+
+
+@lru_cache(maxsize=256)
+def _series(signal, prn, waveform, integration_s, centre, half, n, taps):
+    """The coefficients, kept: every trial of a campaign meets the same sweep."""
     angle = np.pi * (np.arange(n) + 0.5) / n
-    values = _tap_vectors(spec, 0.5 * (low + high) + half * np.cos(angle), taps)
+    x = centre + half * np.cos(angle)
+    values = _tap_vectors(signal, prn, waveform, integration_s, x, np.array(taps))
     basis = np.cos(np.outer(np.arange(n), angle)) * (2.0 / n)
     basis[0] *= 0.5
-    return (0.5 * (low + high), half), (basis @ values).astype(np.complex64)
+    out = (basis @ values).astype(np.complex64)
+    out.flags.writeable = False
+    return out
 
 
 def jammer_hz(spec, jammer):
@@ -465,7 +476,8 @@ def jammer_hz(spec, jammer):
 def cw_taps(spec, cw):
     """Taps of a CW at its frequency of t = 0, phase zero at mid-interval, complex128 (K,); prompt of the signal = 1."""
     x = np.array([jammer_hz(spec, cw) * spec.integration_s])
-    return 10 ** (cw.js_db / 20) * _tap_vectors(spec, x, spec.tap_array_chips)[0]
+    code = spec.signal, spec.prn, spec.waveform
+    return 10 ** (cw.js_db / 20) * _tap_vectors(*code, spec.integration_s, x, spec.tap_array_chips)[0]
 
 
 def _keys(seed):
@@ -611,7 +623,8 @@ class _WideNBI:
         self.jammer, self.key = jammer, np.uint64((int(stage.wide_key) + number) % 2**64)
         centre = jammer_hz(stage.spec, jammer)
         k = _nbi_lines(stage, centre, jammer.bandwidth_hz)
-        vectors = _line_vectors(stage.spec, k, stage.taps)
+        spec = stage.spec
+        vectors = _line_vectors(spec.signal, spec.prn, spec.waveform, k, stage.taps)
         power = _sinc2_mean(k * stage.line_hz - centre, jammer.bandwidth_hz, stage.spec.integration_s)
         C = (vectors.T * (power * 10 ** (jammer.js_db / 10))) @ vectors.conj()
         value, vector = np.linalg.eigh(0.5 * (C + C.conj().T))
@@ -897,9 +910,10 @@ def _records(columns, epoch0, T):
 class OpenLoopRun:
     """No loops and no tracking error: ``block(i)`` is a pure function of the seed and i.
 
-    All terms but the noise are rank one, (taps) x (time), so a block is a single matrix product; the delay
-    of an echo is held at its middle for that (``start`` moves it every epoch).
-    Z = [F | R | echoes | lines] [normals ; time sequences], with columns in-phase then quadrature.
+    All terms but the noise are rank one, (taps) x (time), so a block is a matrix product; the delay of an
+    echo is held at its middle for that (``start`` moves it every epoch).
+    Z = [R | echoes | lines | F] [time sequences ; normals], with columns in-phase then quadrature. F is lower
+    triangular where R has a Cholesky factor: the upper half of the taps then needs half of the normals.
     """
 
     def __init__(self, spec, seed):
@@ -907,7 +921,13 @@ class OpenLoopRun:
         self.stage = _Stage(spec, seed, spec.tap_array_chips)
         self.n_taps = len(self.stage.taps)
         self.R = spec.autocorrelation(self.stage.taps).astype(np.float32)
+        triangular = not np.triu(self.stage.factor, 1).any()
+        self._upper = self.n_taps // 2 if triangular else 0
+        self._slow = [n for n in self.stage.nbis if isinstance(n, _SlowNBI)]
+        self._wide = [n for n in self.stage.nbis if isinstance(n, _WideNBI)]
         self._key, self._series = None, {}
+        self.inner = np.empty((0, 2 * BLOCK_EPOCHS), np.float32)
+        self.out = np.empty((self.n_taps, 2 * BLOCK_EPOCHS), np.float32)
         self.block_epochs = BLOCK_EPOCHS
 
     def block(self, index):
@@ -915,18 +935,28 @@ class OpenLoopRun:
 
         The array is reused by the next call.
         """
-        s = self.stage
-        signs = s.signs(index)
-        lines = self._lines(index)
+        s, upper = self.stage, self._upper
+        lines = self._lines(index) if len(s.cws) else ()
         gain, chips = s.echo_block(index)
-        slow = [n for n in s.nbis if isinstance(n, _SlowNBI)]
-        self._buffers(lines, len(gain), slow)
-        n, K = BLOCK_EPOCHS, self.n_taps
-        s.normals(s.key, index, self.inner[:K])
-        direct = np.ones(n, np.float32) if self.spec.wiped else signs
-        jam = signs if self.spec.wiped else np.ones(n, np.float32)
-        self.inner[K, :n], self.inner[K, n:] = direct, 0.0
-        row = K + 1
+        self._buffers(lines, len(gain))
+        terms = len(self.inner) - self.n_taps
+        self._sequences(index, lines, gain, chips)
+        s.normals(s.key, index, self.inner[terms:])
+        if upper:
+            np.matmul(self.left[:upper, : terms + upper], self.inner[: terms + upper], out=self.out[:upper])
+        np.matmul(self.left[upper:], self.inner, out=self.out[upper:])
+        for nbi in self._wide:
+            self.out += nbi.columns(s, index, s.mid_s(index))
+        return self.out
+
+    def _sequences(self, index, lines, gain, chips):
+        """The time sequences of a block: direct path, echoes, lines of CW and of narrow-band noise."""
+        s, n = self.stage, BLOCK_EPOCHS
+        signs = s.signs(index)
+        one = np.ones(n, np.float32)
+        direct, jam = (one, signs) if self.spec.wiped else (signs, one)
+        self.inner[0, :n], self.inner[0, n:] = direct, 0.0
+        row = 1
         for g, d in zip(gain, chips):
             self.left[:, row] = self.spec.autocorrelation(s.taps + d[n // 2])
             self.inner[row, :n], self.inner[row, n:] = direct * g.real, direct * g.imag
@@ -936,16 +966,10 @@ class OpenLoopRun:
             part = self.inner[row : row + 2 * terms]
             cw_sequences(s.cws[j], centre, half, index * n, self.spec.integration_s, shift_s, jam, part)
             row += 2 * terms
-        mid_s = s.mid_s(index)
-        for nbi in slow:
-            for x in nbi.sequence(index, mid_s):
+        for nbi in self._slow:
+            for x in nbi.sequence(index, s.mid_s(index)):
                 self.inner[row, :n], self.inner[row, n:] = jam * x.real, jam * x.imag
                 row = self._quadrature(row)
-        np.matmul(self.left, self.inner, out=self.out)
-        for nbi in s.nbis:
-            if isinstance(nbi, _WideNBI):
-                self.out += nbi.columns(s, index, mid_s)
-        return self.out
 
     def __call__(self, n_epochs, epoch0=0):
         """Epochs from ``epoch0`` as complex64 (n_epochs, K)."""
@@ -982,20 +1006,19 @@ class OpenLoopRun:
             out.append((j, span, len(vectors)))
         return tuple(out)
 
-    def _buffers(self, lines, n_echo, slow):
+    def _buffers(self, lines, n_echo):
         if self._key == (lines, n_echo):
             return
         self._key = lines, n_echo
         series = {key[0]: v for key, (_, v) in self._series.items()}
-        vectors = [series[j] for j, *_ in lines] + [n.vectors for n in slow]
-        K = self.n_taps
-        rows = K + 1 + n_echo + 2 * sum(map(len, vectors))
-        self.left = np.zeros((K, rows), np.float32)
-        self.left[:, :K] = self.stage.factor
-        self.left[:, K] = self.R
+        vectors = [series[j] for j, *_ in lines] + [n.vectors for n in self._slow]
+        K, first = self.n_taps, 1 + n_echo
+        terms = first + 2 * sum(map(len, vectors))
+        self.left = np.zeros((K, terms + K), np.float32)
+        self.left[:, 0], self.left[:, terms:] = self.R, self.stage.factor
         if vectors:
             joined = np.concatenate(vectors)
-            self.left[:, K + 1 + n_echo :: 2] = joined.real.T
-            self.left[:, K + 2 + n_echo :: 2] = joined.imag.T
-        self.inner = np.empty((rows, 2 * BLOCK_EPOCHS), np.float32)
-        self.out = np.empty((K, 2 * BLOCK_EPOCHS), np.float32)
+            self.left[:, first:terms:2] = joined.real.T
+            self.left[:, first + 1 : terms : 2] = joined.imag.T
+        if self.inner.shape[0] != terms + K:
+            self.inner = np.empty((terms + K, 2 * BLOCK_EPOCHS), np.float32)

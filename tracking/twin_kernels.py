@@ -36,6 +36,7 @@ _M1 = _U(0xBF58476D1CE4E5B9)
 _M2 = _U(0x94D049BB133111EB)
 _STRIDE = _U(4096)  # noise blocks per block of epochs: more than any number of taps
 _TWO_PI = 2.0 * math.pi
+_PIECE = 64  # epochs
 
 
 @njit(error_model="numpy")
@@ -110,19 +111,37 @@ def cw_sequences(cw, centre, half_width, epoch0, integration_s, shift_s, signs, 
     w2 = _cycles(step_t2)
     u = ((cw[0] + cw[1] * t) * integration_s - centre) / half_width
     du = step_t2 / half_width
-    for e in range(n):
-        t = (epoch0 + e + 0.5) * integration_s
-        a = cw[3] * signs[e] if cw[4] <= t < cw[5] else 0.0
-        previous, now = a * u, a  # T_-1 = T_1
+    # In pieces: rows are then written in line, and the recurrence over the terms runs in vectors.
+    work = np.empty((5, _PIECE))
+    re, im, us, older, now = work[0], work[1], work[2], work[3], work[4]
+    for begin in range(0, n, _PIECE):
+        m = min(_PIECE, n - begin)
+        for e in range(m):
+            t = (epoch0 + begin + e + 0.5) * integration_s
+            a = cw[3] * signs[begin + e] if cw[4] <= t < cw[5] else 0.0
+            re[e], im[e], us[e], older[e], now[e] = z.real, z.imag, u, a * u, a  # T_-1 = T_1
+            z *= w
+            w *= w2
+            u += du
         for j in range(terms):
-            out[2 * j, e] = now * z.real
-            out[2 * j, n + e] = now * z.imag
-            out[2 * j + 1, e] = -now * z.imag
-            out[2 * j + 1, n + e] = now * z.real
-            previous, now = now, 2.0 * u * now - previous
-        z *= w
-        w *= w2
-        u += du
+            _term(out, 2 * j, begin, m, re, im, us, older, now)
+
+
+@njit(error_model="numpy")
+def _term(out, row, begin, m, re, im, us, older, now):
+    """One term of ``cw_sequences`` over a piece, and the step to the next."""
+    n = out.shape[1] // 2
+    in_phase, quadrature = out[row, begin : begin + m], out[row, n + begin : n + begin + m]
+    turned_i, turned_q = out[row + 1, begin : begin + m], out[row + 1, n + begin : n + begin + m]
+    for e in range(m):
+        i = _U(e)
+        x, y = _F(now[i] * re[i]), _F(now[i] * im[i])
+        in_phase[i], quadrature[i], turned_i[i], turned_q[i] = x, y, -y, x
+    for e in range(m):
+        i = _U(e)
+        following = 2.0 * us[i] * now[i] - older[i]
+        older[i] = now[i]
+        now[i] = following
 
 
 @njit(error_model="numpy")
