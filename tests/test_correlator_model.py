@@ -5,22 +5,16 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from signals.clock import ClockSpec
 from signals.constants import METRES_PER_CHIP, WAVELENGTH_M
-from signals.jammers import CW, Narrowband, Wideband
-from signals.modulation import SIGNALS, autocorrelation
+from signals.modulation import autocorrelation
 from signals.multipath import Aeronautical, Echoes, echo_gain
-from signals.sky import ScriptedSpec, SkySpec
-from signals.trajectory import Static
 from tracking.correlator_model import (
     Dynamics,
     Twin,
     TwinCW,
     TwinNBI,
     code_spectrum,
-    jammer_hz,
     noise_sigma,
-    twin_jammer,
     worst_line,
 )
 from tracking.loops import dll_gains, pll_gains
@@ -438,56 +432,3 @@ def test_other_bad_input():
         Twin(**GPS).start(1, steered=True)(10)
     with pytest.raises(ValueError, match="shape"):
         Twin(**GPS).start(1)(10, truth=np.zeros((3, 3)))
-
-
-@pytest.mark.parametrize(
-    ("signal", "prn", "cn0_dbhz", "jammer"),
-    [
-        ("L1CA", 6, 45.0, CW(js_db=9.0, against="G06", start_s=2.0, line={"signal": "L1CA", "prn": 6, "rate_hz_s": 3.0})),
-        ("L1CA", 6, 45.0, CW(jn0_dbhz=60.0, freq_hz=12_345.0, rate_hz_s=-2.0)),
-        ("L1CA", 6, 45.0, Narrowband(power_dbw=-150.0, bandwidth_hz=1e4, stop_s=4.0,
-         line={"signal": "L1CA", "prn": 6, "line": 30, "offset_hz": 7.0, "follow_doppler": False})),
-        ("E1B", 38, 42.0, Narrowband(js_db=10.0, against="E38", bandwidth_hz=1e5, line={"signal": "E1B", "prn": 38})),
-    ],
-)  # fmt: skip
-def test_a_jammer_of_a_scenario_in_the_twin(signal, prn, cn0_dbhz, jammer):
-    """Frequency beside the received signal and power over the component, as the run of the samples has them."""
-    doppler_hz = 1500.0
-    system = SIGNALS[signal].system
-    total_dbhz = cn0_dbhz + (0.0 if signal == "L1CA" else 10 * math.log10(2))
-    sky = SkySpec(
-        source="none",
-        scripted=(
-            ScriptedSpec(
-                signal="L1CA" if system == "G" else "E1", prn=prn, cn0_dbhz=total_dbhz, doppler_hz=doppler_hz
-            ),
-        ),
-    ).start(Static(lat_deg=47.0, lon_deg=15.0, height_m=400.0).start(), ClockSpec().start(3, 6.0), 6.0)
-    run = jammer.start(4.096e6, 0.0, 6.0, 1, sky)
-    twin = twin_jammer(jammer, signal, prn, cn0_dbhz)
-    settings = {
-        "signal": signal,
-        "prn": prn,
-        "cn0_dbhz": cn0_dbhz,
-        "integration_s": 4e-3,
-        "doppler_hz": doppler_hz,
-    }
-    spec = Twin(**settings, jammers=(twin,))
-    for t in (2.5, 3.5):
-        freq_hz = jammer_hz(spec, twin) + getattr(twin, "rate_hz_s", 0.0) * t + doppler_hz
-        # the twin's line is that of the nominal code, whose Doppler moves it by 1e-6 of its frequency
-        assert freq_hz == pytest.approx(run.freq_hz(t)[0], abs=1.0)
-    row = run.truth([round(3.0 * 4.096e6)])[0]
-    assert twin.js_db == pytest.approx(row["jn0_dbhz"] - cn0_dbhz, abs=1e-9)
-    assert twin.start_s == jammer.start_s and twin.end_s == (jammer.stop_s or math.inf)
-
-
-def test_what_the_twin_cannot_draw_of_a_scenario_is_refused():
-    for jammer, words in (
-        (Wideband(jn0_dbhz=70.0), "draws CW and Narrowband of constant power, not Wideband"),
-        (CW(jn0_dbhz=70.0, profile=((0.0, 0.0), (1.0, 3.0))), "with a profile"),
-        (CW(js_db=3.0, against="G07"), "knows G06 alone"),
-        (Narrowband(jn0_dbhz=70.0, bandwidth_hz=1e3, rate_hz_s=2.0), "leave rate_hz_s out"),
-    ):
-        with pytest.raises(ValueError, match=words):
-            twin_jammer(jammer, "L1CA", 6, 45.0)

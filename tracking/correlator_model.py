@@ -24,7 +24,6 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from signals.codes import primary_code, secondary_code
 from signals.constants import CHIP_RATE_HZ, CYCLES_PER_CHIP, WAVELENGTH_M
-from signals.jammers import CW, Narrowband
 from signals.modulation import SIGNALS, autocorrelation, chip_waveform
 from signals.multipath import MultipathSpec
 from tracking.discriminators import CARRIER_DISCRIMINATORS, CODE_DISCRIMINATORS, code_scale_chips
@@ -52,7 +51,6 @@ __all__ = [
     "filtered_autocorrelation",
     "jammer_hz",
     "noise_sigma",
-    "twin_jammer",
     "worst_line",
 ]
 
@@ -155,56 +153,6 @@ class Dynamics(_Spec):
 
 
 Interferer = Annotated[TwinCW | TwinNBI, Field(discriminator="kind")]
-
-
-def twin_jammer(jammer: CW | Narrowband, signal: str, prn: int, cn0_dbhz: float) -> TwinCW | TwinNBI:
-    """A scenario's jammer for a twin of this signal component.
-
-    ``cn0_dbhz`` is the component's own. The scenario's ``js_db`` refers to the whole satellite, of which each
-    component of E1 has half. Raises ValueError for what the twin cannot draw: other kinds, profiles, noise whose
-    centre moves, and powers against or lines of another satellite that follow its Doppler.
-    """
-    name = f"{SIGNALS[signal].system}{prn:02d}"
-    if not isinstance(jammer, CW | Narrowband) or jammer.profile:
-        raise ValueError(
-            f"the twin draws CW and Narrowband of constant power, not {jammer.kind}"
-            f"{' with a profile' if jammer.profile else ''}: use samples"
-        )
-    line = jammer.line
-    own = line is not None and line.signal[:2] == signal[:2] and line.prn == prn
-    if (jammer.against or name) != name or (line is not None and line.follow_doppler and not own):
-        raise ValueError(f"the twin knows {name} alone: give the jammer's power and line against it")
-    change = {
-        "js_db": _js_db(jammer, signal, cn0_dbhz),
-        "start_s": jammer.start_s,
-        "end_s": math.inf if jammer.stop_s is None else jammer.stop_s,
-    }
-    rate_hz_s = jammer.rate_hz_s if line is None else line.rate_hz_s
-    if line is None:
-        change |= {"freq_hz": jammer.freq_hz}
-    elif line.follow_doppler:
-        k = round(line.freq_hz() * SIGNALS[signal].code_period_s)
-        change |= {"line": k, "offset_hz": line.offset_hz}
-    else:
-        change |= {"freq_hz": line.freq_hz(), "offset_hz": line.offset_hz}
-    if isinstance(jammer, Narrowband):
-        if rate_hz_s:
-            raise ValueError(
-                "the twin's narrow-band noise stays where it is: leave rate_hz_s out, or use samples"
-            )
-        return TwinNBI(bandwidth_hz=jammer.bandwidth_hz, **change)
-    # The scenario counts the sweep from the start of the jammer, the twin from t = 0.
-    offset_hz = change.get("offset_hz", 0.0) - rate_hz_s * jammer.start_s
-    return TwinCW(**change | {"offset_hz": offset_hz, "rate_hz_s": rate_hz_s})
-
-
-def _js_db(jammer: CW | Narrowband, signal: str, cn0_dbhz: float) -> float:
-    """Power over that of the component."""
-    if jammer.js_db is not None:
-        return jammer.js_db + (0.0 if signal == "L1CA" else 10 * math.log10(2.0))
-    if jammer.jn0_dbhz is not None:
-        return jammer.jn0_dbhz - cn0_dbhz
-    return (jammer.power_dbw or 0.0) - jammer.n0_dbw_hz - cn0_dbhz
 
 
 class Twin(_Spec):
