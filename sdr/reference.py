@@ -117,7 +117,7 @@ def default_text(field: FieldInfo) -> str:
     """The default as TOML; tables have their own."""
     if field.is_required():
         return "**required**"
-    value = field.get_default(call_default_factory=True)
+    value = field.get_default(call_default_factory=True, validated_data={})
     if value is None:
         return "not set"
     if isinstance(value, BaseModel):

@@ -128,8 +128,8 @@ class FrontEndSpec(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     fs_hz: float = Field(default=4.096e6, gt=0.0, le=200e6)
-    """Sample rate. Whole samples per chip let a code of little Doppler rest between them, where no receiver sees it
-    move: at 2.046 MHz positions err by 50 to 70 m, at 4 to 16 samples per chip by 1 to 4 m; 2.048 MHz does not."""
+    """Sample rate. With whole samples per chip (or few on few), where a code with sharp edges hides its delay, codes and
+    their replicas are limited to the band that is sampled, at the cost of what lies beyond (0.45 dB at 2.046 MHz)."""
     if_hz: float = Field(default=0.0, ge=-100e6, le=100e6)
     """Intermediate frequency."""
     complex: bool = True

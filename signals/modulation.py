@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from fractions import Fraction
 from functools import lru_cache
 
 import numba as nb
@@ -21,12 +22,14 @@ __all__ = [
     "chip_waveform",
     "code_lines",
     "code_table",
+    "sampled_band_hz",
     "worst_lines",
 ]
 
 BLOCK = 1024
 """Most samples that are read from a row of a code table before the row is chosen again."""
 _MIN_FS_BOC61_HZ = 15e6  # below it the lobes of BOC(6,1) at +-6.138 MHz do not fit between -fs/2 and fs/2
+_FEW_PLACES = 64
 _SLOTS = {"BPSK": 1, "BOC11": 2, "BOC61": 12, "CBOC+": 12, "CBOC-": 12}
 
 
@@ -95,6 +98,21 @@ def _chip_transform(waveform, nu):
     return out * np.sinc(nu / n) / n
 
 
+def sampled_band_hz(fs_hz):
+    """Band to which codes are limited at a sampling rate that stands still against their chips; None elsewhere.
+
+    With p samples on q chips, p and q small, samples fall on p places of a chip and no others: a code with sharp edges
+    looks the same wherever between two of them it begins, and its delay is lost to half a place (72 m at two samples
+    per chip). What tells it is the band limit of the front end, which rounds the edges: fs/2, in the code sent and in
+    its replica.
+    """
+    ratio = fs_hz / CHIP_RATE_HZ
+    near = Fraction(ratio).limit_denominator(_FEW_PLACES)
+    # 1e-7: the places wander by less than 0.1 chip per second.
+    still = abs(float(near) / ratio - 1.0) < 1e-7
+    return fs_hz / 2 if still and near.numerator < _FEW_PLACES else None
+
+
 def code_table(signal, prn, fs_hz, n_phase=64, waveform=None, bandlimit_hz=None, path=None):
     """Sampled replica of one code, for synthesis and for correlation.
 
@@ -109,7 +127,8 @@ def code_table(signal, prn, fs_hz, n_phase=64, waveform=None, bandlimit_hz=None,
     waveform : str, optional
         "BPSK", "BOC11", "CBOC+", "CBOC-"; default the transmitted one.
     bandlimit_hz : float, optional
-        Remove everything beyond min(bandlimit_hz, fs/2) from the waveform (brick wall, both sides).
+        Remove everything beyond min(bandlimit_hz, fs/2) from the waveform (brick wall, both sides). Default:
+        ``sampled_band_hz``.
 
     Returns
     -------
@@ -131,6 +150,7 @@ def code_table(signal, prn, fs_hz, n_phase=64, waveform=None, bandlimit_hz=None,
         raise ValueError(f"fs_hz = {fs_hz:g}: a code table needs a rate of at least 1e5")
     if bandlimit_hz is not None and not bandlimit_hz > 0:
         raise ValueError(f"bandlimit_hz = {bandlimit_hz:g} must be positive")
+    bandlimit_hz = bandlimit_hz or sampled_band_hz(fs_hz)
     length = len(chips)
     per_chip = fs_hz / CHIP_RATE_HZ
     table = np.empty((n_phase, math.ceil(length * per_chip) + BLOCK + 8), np.int8)
@@ -242,11 +262,17 @@ def autocorrelation(signal, prn, delay_chips, waveform_tx=None, waveform_rx=None
     return slots[k % n] + (x - k) * (slots[(k + 1) % n] - slots[k % n])
 
 
-def chip_acf(delay_chips, waveform_tx="BPSK", waveform_rx=None):
+def chip_acf(delay_chips, waveform_tx="BPSK", waveform_rx=None, bandlimit_hz=None):
     """Correlation of one chip with one chip of the replica: ``autocorrelation`` of an ideal code.
 
-    R(d) = integral of p_tx(x) p_rx(x + d), zero beyond +-1 chip; BPSK: 1 - |d|.
+    R(d) = integral of p_tx(x) p_rx(x + d), zero beyond +-1 chip; BPSK: 1 - |d|. With ``bandlimit_hz`` B the integral
+    of conj(P_tx) P_rx exp(2 pi i nu d) over |nu| <= B / f_c, P the transforms of the chips.
     """
+    if bandlimit_hz is not None:
+        nu, step = np.linspace(0.0, bandlimit_hz / CHIP_RATE_HZ, 4001, retstep=True)
+        cross = np.conj(_chip_transform(waveform_tx, nu)) * _chip_transform(waveform_rx or waveform_tx, nu)
+        cross *= 2.0 * step * np.where((nu == 0.0) | (nu == nu[-1]), 0.5, 1.0)
+        return np.real(np.exp(2j * np.pi * np.multiply.outer(delay_chips, nu)) @ cross)
     tx, rx = (
         np.repeat(p, 12 // len(p))
         for p in (chip_waveform(waveform_tx), chip_waveform(waveform_rx or waveform_tx))

@@ -163,6 +163,22 @@ def test_galileo_alone_and_together(tmp_path):
     assert {u[0] for u in alone["fix"]["used"]} == {"E"}
 
 
+def test_whole_samples_per_chip_cost_no_accuracy(tmp_path):
+    """Two samples per chip on a clock that stands still: with sharp codes the position was 47 to 72 m off."""
+    over = ["front_end.fs_hz=2.046e6", "clock={bias_s=2e-4, drift_s_s=0}", "duration_s=45"]
+    result = jobs.run("demo", output=tmp_path / "two.h5", overrides=over, quiet=True)
+    with h5py.File(tmp_path / "two.h5") as h5:
+        truth = h5["truth/satellites"][:]
+        for group in h5["tracking"].values():
+            epochs, prn = group["epochs"][:], group["epochs"].attrs["prn"]
+            errors = tracking_errors(epochs, truth[truth["prn"] == prn], 2.046e6, "L1CA")
+            t_s, code_m = (errors[name][errors["t_s"] > 15] for name in ("t_s", "code_m"))
+            # 3 dB below the weakest satellite's 39.7: what the others and the band cost. 2 B values a second.
+            sigma_m = METRES_PER_CHIP * dll_jitter_chips(36.7, 1.0, 0.02, 0.5)
+            assert abs(code_m.mean()) < 5 * sigma_m / np.sqrt(2 * (t_s[-1] - t_s[0])), prn
+    assert result["fix"]["rms_3d_m"] < 2.0
+
+
 def test_help_imports_nothing_heavy():
     code = (
         "import sys; from sdr.__main__ import app; app(['--help'], exit_on_error=False, result_action='return_value'); "

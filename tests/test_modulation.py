@@ -17,6 +17,7 @@ from signals.modulation import (
     chip_waveform,
     code_lines,
     code_table,
+    sampled_band_hz,
     worst_lines,
 )
 
@@ -51,7 +52,7 @@ def test_chip_waveforms_have_unit_power_and_cboc_its_split():
 
 @pytest.mark.parametrize(
     "signal, waveform, fs_hz",
-    [(s, w, fs) for s, w in (("L1CA", "BPSK"), ("E1B", "BOC11")) for fs in (4.0e6, 4.096e6, 5.456e6, 25e6)]
+    [(s, w, fs) for s, w in (("L1CA", "BPSK"), ("E1B", "BOC11")) for fs in (4.0e6, 4.096e6, 5.5e6, 25e6)]
     + [("E1C", "CBOC-", 25e6), ("E1B", "CBOC+", 16.368e6 + 1e3)],
 )
 def test_every_entry_is_the_waveform_at_its_phase(signal, waveform, fs_hz):
@@ -120,7 +121,7 @@ def _line_powers(t, signal):
 
 @pytest.mark.parametrize("signal, waveform", [("E1B", "CBOC+"), ("E1C", "CBOC-")])
 def test_cboc_at_low_rates_keeps_its_spectrum_and_loses_what_does_not_fit(signal, waveform):
-    fs_hz, band_line = 4.092e6, 8184  # fs/2 at k = 8184; the table is a whole number of entries per period
+    fs_hz, band_line = 4.096e6, 8192  # fs/2 at k = 8192; the table is a whole number of entries per period
     t = code_table(signal, 11, fs_hz, 64)
     got = _line_powers(t, signal)
     chips, L = np.fft.fft(primary_code(signal, 11)), 4092
@@ -135,9 +136,10 @@ def test_cboc_at_low_rates_keeps_its_spectrum_and_loses_what_does_not_fit(signal
     boc61 = np.where(k <= band_line, transform(chip_waveform("BOC61")), 0)
     wanted = math.sqrt(10 / 11) * transform(np.repeat([1.0, -1.0], 6)) + sign * math.sqrt(1 / 11) * boc61
     wanted = np.abs(chips[k % L] / L * wanted) ** 2
-    # int8 levels: rounding noise scale^2 / 12 spread over all lines; interpolation errs 2 % of limited components.
+    # int8 levels: rounding noise scale^2 / 12 spread over all lines; interpolation errs 2 % of limited components; 1.5
+    # sharp edges per chip, up to half a step of 1/256 chip early or late: a quarter on average, of power 4.
     noise = t.scale**2 / 12
-    assert np.sum(np.abs(got[1 : 6 * band_line] - wanted)) < 2 * noise + 0.002
+    assert np.sum(np.abs(got[1 : 6 * band_line] - wanted)) < 2 * noise + 0.002 + 1.5 * 4 * 0.25 / 256
     assert got[k][k > 5.5 * 4092].sum() < 0.1 * np.sum(
         np.abs(chips[k % L] / L * transform(chip_waveform("BOC61"))) ** 2
     )
@@ -153,6 +155,50 @@ def test_band_limit_is_a_brick_wall(signal, waveform):
     inside = 10 ** (level_db / 10)
     assert power[: len(lines_hz)] == pytest.approx(inside, abs=0.03 * inside.max())
     assert power[freq_hz > limit_hz].sum() < 2 * t.scale**2 / 12 + 1e-3
+
+
+def test_rates_that_stand_still_against_the_chips():
+    for places, fs_hz in ((2, 2.046e6), (5, 2.5575e6), (4, 4.092e6), (16, 16.368e6), (63, 63 * 1.023e6)):
+        assert sampled_band_hz(fs_hz) == fs_hz / 2, places
+    # 2048 places on 1023 chips, 4000 on 1023, 100 on 31, 64 on 1; and a clock 1 ppm off slides by a chip a second.
+    for fs_hz in (2.048e6, 4e6, 3.3e6, 65.472e6, 4.092e6 * (1 + 1e-6)):
+        assert sampled_band_hz(fs_hz) is None
+
+
+@pytest.mark.parametrize("signal, fs_hz", [("L1CA", 2.046e6), ("L1CA", 4.092e6), ("E1B", 4.092e6)])
+def test_delays_between_samples_are_seen_at_whole_samples_per_chip(signal, fs_hz):
+    """Early minus late of a replica vanishes at the delay of the code, wherever between samples that lies."""
+    per_chip, n_tx, n_rx = round(fs_hz / CHIP_RATE_HZ), 256, 64
+    n = SIGNALS[signal].code_length_chips * per_chip
+
+    def samples(table, chips):
+        q = round(chips * per_chip * table.table.shape[0])
+        return table.table[q % table.table.shape[0], (q // table.table.shape[0] + np.arange(n)) % n] * 1.0
+
+    sent = code_table(signal, 3, fs_hz, n_tx)
+    replica = code_table(signal, 3, fs_hz, n_rx, "BPSK" if signal == "L1CA" else "BOC11")
+    spacing, step = 0.25, 1 / (n_rx * per_chip)
+    for delay in (np.arange(5) + 0.3) / 5 / per_chip:
+        x = samples(sent, 10 + delay)
+        early, late = (
+            np.array([x @ samples(replica, 10 + k * step + side) for k in range(-n_rx, n_rx)])
+            for side in (spacing / 2, -spacing / 2)
+        )
+        crossing = np.flatnonzero(np.diff(np.sign(early - late)))
+        near = crossing[np.argmin(np.abs(crossing - n_rx - delay / step))]
+        # Half a step of each grid, and the place of the crossing between two steps.
+        assert abs((near + 0.5 - n_rx) * step - delay) <= (1 / n_rx + 0.5 / n_rx + 0.5 / n_tx) / per_chip
+
+
+def test_chip_correlation_in_a_band():
+    d = np.linspace(-1.2, 1.2, 25)
+    for tx, rx in (("BPSK", "BPSK"), ("CBOC-", "BOC11")):
+        # What lies beyond B carries less than 12 slopes / (2 pi^2 B/fc) of the power (edges of p: 1 / (pi nu)^2 each).
+        assert chip_acf(d, tx, rx, 1e9) == pytest.approx(
+            chip_acf(d, tx, rx), abs=12 / (np.pi**2 * 1e9 / CHIP_RATE_HZ)
+        )
+    # The main lobe of sinc^2 holds 90.28 %.
+    assert chip_acf(0.0, bandlimit_hz=CHIP_RATE_HZ) == pytest.approx(0.9028, abs=5e-5)
 
 
 @pytest.mark.parametrize("waveform", ["BPSK", "BOC11", "CBOC+", "CBOC-"])

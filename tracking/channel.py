@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 
 from signals.codes import secondary_code
 from signals.constants import CHIP_RATE_HZ, F_L1_HZ
-from signals.modulation import BLOCK, SIGNALS, autocorrelation, chip_acf, code_table
+from signals.modulation import BLOCK, SIGNALS, autocorrelation, chip_acf, code_table, sampled_band_hz
 from tracking.discriminators import CARRIER_DISCRIMINATORS, CODE_DISCRIMINATORS, code_scale_chips
 from tracking.kernels import CHANNEL, HISTORY, KIND_CA, KIND_DATA, KIND_PILOT, SYMBOL, track_slab
 from tracking.lock import STATE_BIT_SYNC, STATE_IDLE, STATE_LOCKED, STATE_LOST, STATE_PULL_IN
@@ -111,10 +111,6 @@ class E1Tracking(_Loops):
     """The pilot E1-C carries the loops, or the data E1-B alone."""
     integration_ms: int = Field(20, ge=4, le=100)
     """Coherent integration."""
-    early_late_space_chips: float = Field(0.25, gt=0.0, lt=0.6)
-    """Whole spacing between early and late."""
-    very_early_late_space_chips: float = Field(1.0, ge=0.8, le=1.2)
-    """Whole spacing between very early and very late."""
     replica: Literal["BOC11", "CBOC"] = "BOC11"
     """Waveform of the replica."""
     side_peak_protection: bool = True
@@ -153,6 +149,12 @@ class TrackingSpec(BaseModel):
     """Carrier-lock indicator from which a channel counts as locked."""
     lock_out: float = Field(0.4, gt=-1.0, lt=1.0)
     """Carrier-lock indicator below which it no longer does."""
+    early_late_space_chips: float = Field(
+        default_factory=lambda data: 0.1 if data.get("replica") == "CBOC" else 0.25, gt=0.0, lt=0.6
+    )
+    """Whole spacing between early and late; 0.1 with a CBOC replica, whose peak has no slope at 0.25."""
+    very_early_late_space_chips: float = Field(1.0, ge=0.8, le=1.2)
+    """Whole spacing between very early and very late."""
     lost_after_s: float = Field(1.0, gt=0.0, le=600.0)
     """A channel without lock for this long is given up."""
     settle_s: float = Field(0.6, ge=0.2, le=10.0)
@@ -385,7 +387,8 @@ class Tracker:
         incoming = waveform
         if not is_ca and self.fs_hz >= _BOC61_FITS_HZ:
             incoming = SIGNALS[_text(st["signal"])].waveform
-        acf = lambda d: chip_acf(d, incoming, waveform)  # noqa: E731
+        band_hz = sampled_band_hz(self.fs_hz)
+        acf = lambda d: chip_acf(d, incoming, waveform, band_hz)  # noqa: E731
         spacing = float(offsets[int(st["early"])] - offsets[int(st["late"])])
         very = 1.0 if is_ca else float(offsets[int(st["very_early"])] - offsets[int(st["very_late"])])
         st["code_scale_chips"] = code_scale_chips(loops.code_discriminator, acf, spacing, very)
