@@ -130,55 +130,98 @@ class NoiseRmdRun:
 
 
 @njit(cache=True, nogil=True)
-def follow(epochs, ring, state):
-    """Differences of successive code discriminators of one channel, in chips, into ``ring`` (N,).
+def follow(epochs, counts, slot, ring, done, last):
+    """Differences of successive code discriminators of all channels of a slab, in chips, into ``ring`` (S, N).
 
-    ``state`` (3,): differences so far, sample after the last integration in lock (-1: none), its discriminator.
+    ``epochs``: columns ``COLUMNS`` of EPOCH, each (C, n); ``counts`` (C,) of them valid; ``slot`` (C,) row of each channel, -1:
+    none. ``done`` (S,) differences so far; ``last`` (S, 5): sample after the last integration in lock (-1: none), its
+    discriminator, and of the newest integration its samples, C/N0 (dB-Hz) and whether it was in lock
+    (-1: nothing new).
     """
-    for e in epochs:
-        if e.state != STATE_LOCKED:
-            state[1] = -1.0
+    first, samples, state, error, cn0 = epochs
+    for c in range(counts.size):
+        s = slot[c]
+        if s < 0 or counts[c] == 0:
             continue
-        if state[1] == e.sample_index:
-            ring[np.int64(state[0]) % ring.size] = e.code_error_chips - state[2]
-            state[0] += 1.0
-        state[1], state[2] = e.sample_index + e.n_samples, e.code_error_chips
+        for k in range(counts[c]):
+            if state[c, k] != STATE_LOCKED:
+                last[s, 0] = -1.0
+                continue
+            if last[s, 0] == first[c, k]:
+                ring[s, done[s] % ring.shape[1]] = error[c, k] - last[s, 1]
+                done[s] += 1
+            last[s, 0], last[s, 1] = first[c, k] + samples[c, k], error[c, k]
+        k = counts[c] - 1
+        last[s, 2], last[s, 3] = samples[c, k], cn0[c, k]
+        last[s, 4] = 1.0 if state[c, k] == STATE_LOCKED else 0.0
+
+
+@njit(cache=True, nogil=True)
+def window_variances(ring, done, scheme, decay, out):
+    """``window_variance`` of every row of ``ring`` (S, N) into ``out`` (S,)."""
+    for s in range(out.size):
+        out[s] = window_variance(ring[s], done[s], scheme, decay)
+
+
+COLUMNS = ("sample_index", "n_samples", "state", "code_error_chips", "cn0_dbhz")
 
 
 class DiscriminatorNoise:
     """Range variance of channels from differences of their successive code discriminators, without a second channel.
 
-    ``hear`` every channel's new integrations; ``estimate`` gives the variances of those whose window is full.
+    ``hear`` every slab; ``estimate`` gives the variances of the satellites whose window is full.
     """
 
     def __init__(self, spec: NoiseRmd, fs_hz: float):
         self.spec, self.fs_hz = spec, fs_hz
-        self._held: dict[str, tuple[list[np.ndarray], Any]] = {}
-        self._rings: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+        self._channels: dict[tuple[str, int], int] = {}
+        self._slot = np.zeros(0, np.int64)
+        self._names: list[str] = []
+        self._loops: list[tuple[float, float]] = []
+        self._ring = np.zeros((0, spec.window))
+        self._done, self._last = np.zeros(0, np.int64), np.zeros((0, 5))
 
-    def hear(self, name: str, epochs: np.ndarray, loops: Any) -> None:
-        """``epochs``: EPOCH rows of satellite ``name``; ``loops``: its tracking Spec."""
-        self._held.setdefault(name, ([], loops))[0].append(epochs.copy())
+    def hear(self, channels: dict[tuple[str, int], int], epochs: np.ndarray, counts: np.ndarray, loops: Any):
+        """``epochs`` (C, n): EPOCH rows of a slab, ``counts`` (C,) of them valid; ``channels``: channel of (signal, PRN);
+        ``loops``: the TrackingSpec."""
+        if channels != self._channels or len(counts) != len(self._slot):
+            self._seat(channels, len(counts), loops)
+        follow(tuple(epochs[c] for c in COLUMNS), counts, self._slot, self._ring, self._done, self._last)
+
+    def _seat(self, channels, n_channels, loops) -> None:
+        """A row for every satellite that has none, and the row of each channel."""
+        self._channels, self._slot = dict(channels), np.full(n_channels, -1)
+        for (signal, prn), c in channels.items():
+            name = f"{'G' if signal == 'L1CA' else 'E'}{prn:02d}"
+            if name not in self._names:
+                spec = loops.l1ca if signal == "L1CA" else loops.e1
+                self._names.append(name)
+                self._loops.append((spec.early_late_space_chips, spec.dll_bw_hz))
+            self._slot[c] = self._names.index(name)
+        more = len(self._names) - len(self._done)
+        self._ring = np.pad(self._ring, ((0, more), (0, 0)))
+        self._done = np.pad(self._done, (0, more))
+        self._last = np.pad(self._last, ((0, more), (0, 0)), constant_values=-1.0)
 
     def estimate(self, steered: bool = False) -> dict[str, float]:
         """Variances, m^2, by satellite, of those heard since the last call; ``steered``: from outside."""
+        mean = np.empty(len(self._names))
+        window_variances(self._ring, self._done, SCHEMES[self.spec.scheme], self.spec.decay, mean)
         out = {}
-        for name, (parts, loops) in self._held.items():
-            epochs = np.concatenate(parts)
-            ring, state = self._rings.setdefault(
-                name, (np.zeros(self.spec.window), np.array([0.0, -1.0, 0.0]))
-            )
-            follow(epochs, ring, state)
-            last = epochs[-1]
-            if state[0] < self.spec.window or last["state"] != STATE_LOCKED:
-                continue
-            args = SCHEMES[self.spec.scheme], self.spec.decay
-            mean = window_variance(ring, int(state[0]), *args) * METRES_PER_CHIP**2
-            t_s = float(last["n_samples"]) / self.fs_hz
-            gain = code_gain(name[0], loops.early_late_space_chips, round(float(last["cn0_dbhz"])), t_s)
-            out[name] = mean * loop_share(0.0 if steered else loops.dll_bw_hz, t_s, gain) + self.spec.r0_m2
-        self._held.clear()
+        for s in np.flatnonzero((self._last[:, 4] > 0) & (self._done >= self.spec.window)).tolist():
+            name, (spacing, bw_hz) = self._names[s], self._loops[s]
+            _, _, samples, cn0_dbhz, _ = self._last[s].tolist()
+            t_s = samples / self.fs_hz
+            share = _share(name[0], spacing, round(cn0_dbhz), t_s, 0.0 if steered else bw_hz)
+            out[name] = float(mean[s]) * METRES_PER_CHIP**2 * share + self.spec.r0_m2
+        self._last[:, 4] = -1.0
         return out
+
+
+@lru_cache(maxsize=512)
+def _share(system: str, spacing_chips: float, cn0_dbhz: float, t_s: float, dll_bw_hz: float) -> float:
+    """``loop_share`` at the discriminator's gain."""
+    return loop_share(dll_bw_hz, t_s, code_gain(system, spacing_chips, cn0_dbhz, t_s))
 
 
 def loop_share(dll_bw_hz: float, integration_s: float, gain: float = 1.0) -> float:

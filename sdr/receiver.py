@@ -147,7 +147,8 @@ class Receiver:
         for c, mine, _ in rows:
             self.drift.hear(self.tracker.channels["signal"][c].decode(), mine)
         out = Outcome(n0, n_end, found, rows)
-        self._hear(rows)
+        if self.integrity is not None:
+            self.integrity.hear(self.channel_of, epochs, counts, self.spec.tracking)
         if self._steered:
             self._steer(n_end, epochs, counts, out)
         if navigate:
@@ -401,17 +402,6 @@ class Receiver:
         return rows
 
     # -- monitors ---------------------------------------------------------------------------------------------------
-
-    def _hear(self, rows: list[tuple[int, np.ndarray, np.ndarray]]) -> None:
-        """Let the redundant-measurement estimator hear the channels' discriminators."""
-        if self.integrity is None or self.integrity.spec.noise_rmd is None:
-            return
-        heard = {c: epochs for c, epochs, _ in rows}
-        for (signal, prn), c in self.channel_of.items():
-            if c in heard:
-                gps = signal == "L1CA"
-                loops = self.spec.tracking.l1ca if gps else self.spec.tracking.e1
-                self.integrity.hear(f"{'G' if gps else 'E'}{prn:02d}", heard[c], loops)
 
     def _watch(self, out: Outcome) -> None:
         """Let every monitor see the windows of taps; what comes back are flags, for the next epoch."""
