@@ -165,6 +165,7 @@ class Navigator:
         self.log: NavigatorLog | None = None
         """Set one to have the filter's epochs recorded; recording changes nothing."""
         self._remedy: Remedy | None = None
+        self._extra: np.ndarray | None = None
         self._smoothing = np.ones(0)
         self._steered_m = 0.0
         self._state: np.ndarray | None = None  # (5,) last position, bias, ISB
@@ -210,7 +211,7 @@ class Navigator:
 
     def _take(self, remedy):
         """Note the remedy of this epoch; a state handed back replaces the filter's now."""
-        self._remedy = remedy
+        self._remedy, self._extra = remedy, None if remedy is None else remedy.extra
         if remedy is None or (remedy.dx is None and remedy.p is None) or self._filter_sample < 0:
             return
         if remedy.dx is not None:
@@ -594,7 +595,7 @@ class Navigator:
             self._steer(self._x[6], False)
             self._x[6] = 0.0
         self._state = np.array([*self._x[:3], self._x[6], self._x[8]])
-        row = self._row(obs, eph, self._state, self._x[3:6], self._x[7], self._p[:3, :3])
+        row = self._row(obs, eph, self._state, self._x[3:6], self._x[7], self._claim())
         isb_m = self._x[8] if self._reference == b"G" else -self._x[8]
         row["isb_m"] = isb_m if estimate and second[use].any() else np.nan
         part = np.zeros(obs.size, np.uint8)
@@ -610,6 +611,10 @@ class Navigator:
             self.reason = "the filter coasts: no range was accepted for longer than filter.coast_s."
         return row
 
+    def _claim(self):
+        """Covariance of the position, with what the monitors' corrections may be wrong by."""
+        return (self._p if self._extra is None else self._p + self._extra)[:3, :3]
+
     def _fresh(self):
         return self._filter_sample - self._last_range_sample <= self.spec.filter.coast_s * self.fs_hz
 
@@ -623,7 +628,7 @@ class Navigator:
         obs = np.zeros(1, OBSERVATION)
         obs["sample_index"] = sample
         state = np.array([*self._x[:3], self._x[6], self._x[8]])
-        row = self._row(obs, np.atleast_1d(ephemeris), state, self._x[3:6], self._x[7], self._p[:3, :3])
+        row = self._row(obs, np.atleast_1d(ephemeris), state, self._x[3:6], self._x[7], self._claim())
         row["isb_m"], row["valid"] = np.nan, self._fresh()
         for name in ("gdop", "pdop", "hdop", "vdop"):
             row[name] = np.inf

@@ -27,11 +27,14 @@ EXCLUDED_M2 = 1e12
 
 
 class Remedy(NamedTuple):
-    """Rows of REMEDY; ``dx`` (n,), ``p`` (n, n): a state correction and covariance to begin the next epoch with, or None."""
+    """Rows of REMEDY; ``dx`` (n,), ``p`` (n, n): a state correction and covariance to begin the next epoch with, or None;
+    ``extra`` (n, n): what the correction itself may be wrong by, to be reported beside the filter's covariance.
+    """
 
     rows: np.ndarray
     dx: np.ndarray | None = None
     p: np.ndarray | None = None
+    extra: np.ndarray | None = None
 
     def find(self, system, prn) -> np.ndarray:
         """Index of the row of each satellite, -1 where there is none."""

@@ -294,7 +294,7 @@ class Filter:
     """State and workspace of one steering filter for C channel slots.
 
     ``log`` is what the monitors read, and ``own`` (2C,): the last epoch's variances before any answer of theirs, 0 where a
-    channel was not heard.
+    channel was not heard; ``extra`` (n, n) is what their corrections may be wrong by, which no gain knows, or None.
     """
 
     def __init__(self, spec: SteeringSpec, model, x, p, n_channels, log_length=256, barometer=None):
@@ -311,7 +311,7 @@ class Filter:
             np.zeros(n_channels),
         )
         self.los = np.zeros((n_channels, 3))
-        self.own = np.zeros(m)
+        self.own, self.extra = np.zeros(m), None
         self.nis, self.n_rows, self.epochs, self._first = math.nan, 0, 0, 0
         self._ring = empty_log(log_length, n, m)
         self._views = [EpochLog(*row) for row in zip(*self._ring)]
@@ -362,4 +362,4 @@ class Filter:
         """Covariance of the ECEF position (3, 3), m^2."""
         tp, tv = np.empty((3, self.p.shape[0])), np.empty((3, self.p.shape[0]))
         kernels.maps(self.code, self.x, tp, tv)
-        return tp @ self.p @ tp.T
+        return tp @ (self.p if self.extra is None else self.p + self.extra) @ tp.T

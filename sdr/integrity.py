@@ -139,11 +139,14 @@ class IntegrityLive:
         for name, rows in out.items():
             if name in self.alarms:
                 self.alarms[name].add(rows)
-        undo = self._ranges.undo(watch.log)
-        if undo is not None:
-            filter_monitors.moved(undo)
-            dx = undo if dx is None else dx + undo
-        remedy = self.response.answer(snap, t_s, dx, p)
+        removal = self._ranges.remove(watch.log, dx is not None)
+        if removal.dx is not None:
+            filter_monitors.moved(removal.dx)
+            dx = removal.dx if dx is None else dx + removal.dx
+        extra = removal.extra
+        if removal.ended:
+            p, extra = (watch.p if p is None else p) + extra, None
+        remedy = self.response.answer(snap, t_s, dx, p, extra)
         self.remedy = None if remedy is None else watch.hand(remedy)
         if remedy is not None and len(remedy.rows):
             out["response"] = rows_of(remedy, sample, t_s)

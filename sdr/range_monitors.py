@@ -12,6 +12,7 @@ import numpy as np
 from monitors.bias_bank import BiasBank, BiasReport, parity_weight
 from monitors.normal_points import NormalPoints
 from monitors.protection import chi2_limit, quick_levels
+from monitors.separate_bias import BiasRemoval, Removal
 from nav.frames import geodetic_from_ecef, rotation_enu_to_ecef
 from nav.navigator import Snapshot
 from nav.navlog import NavigatorLog
@@ -19,7 +20,7 @@ from sdr.findings import PROTECTION, Alarms, found
 from sdr.respond import Response
 
 MEMORY = 200
-"""Epochs over which the onset of an identified bias is looked for: 40 s at 5 Hz."""
+"""Epochs in which the onset of an offset may lie: 40 s at 5 Hz."""
 RECENT = 50
 """Epochs over which rivals are weighed."""
 ODDS = 99.0
@@ -32,8 +33,11 @@ class RangeMonitors:
     def __init__(self, spec, response: Response, alarms: dict[str, Alarms]) -> None:
         self.spec, self.response, self.alarms = spec, response, alarms
         self._bank: BiasTracker | None = None if spec.bias_bank is None else BiasTracker(spec.bias_bank)
-        self._past: list[tuple[list[str], np.ndarray, np.ndarray, np.ndarray, dict[str, float]]] = []
-        self._new_bias: dict[str, float] = {}
+        self._past: list[tuple[list[str], np.ndarray, np.ndarray, np.ndarray]] = []
+        largest = 0.0 if spec.bias_bank is None else max(map(abs, spec.bias_bank.grid_m))
+        self._removal = BiasRemoval(largest, MEMORY)
+        self._faulty: str | None = None
+        self._declared: dict[str, float] = {}
         self._next_level_s = 0.0
 
     def lack(self, reason: str) -> None:
@@ -47,8 +51,8 @@ class RangeMonitors:
         var = self.response.variance(snap.names, snap.own_m2)
         shift = self.response.shifts(snap.names)
         h = np.column_stack([-snap.los, np.ones(len(snap.names)), snap.second])
-        self._past.append((snap.names, snap.residual_m + shift, h, var, dict(self.response.shift)))
-        del self._past[:-MEMORY]
+        self._past.append((snap.names, snap.residual_m + shift, h, var))
+        del self._past[:-RECENT]
         self._raim(snap, h, var, sample, t_s, out)
         self._biases(snap.names, snap.residual_m + shift, h, var, sample, t_s, out)
         self._protect(snap, h, var, sample, t_s, out)
@@ -110,7 +114,7 @@ class RangeMonitors:
     def _scores(self, epochs: int) -> list[tuple[list[str], np.ndarray, np.ndarray]]:
         """(names, W r, diagonal of W) of the last epochs; zero where the parity says nothing."""
         out = []
-        for names, raw, h, var, _ in self._past[-epochs:]:
+        for names, raw, h, var in self._past[-epochs:]:
             try:
                 w, _ = parity_weight(h, var)
                 out.append((names, w @ raw, np.diag(w)))
@@ -155,33 +159,24 @@ class RangeMonitors:
         limit = self.spec.bias_bank.declare
         out["bias_bank"] = found([name], sample, t_s, value, limit, bias_m, " ".join(rivals).encode())
         if self.response.spec.bias:
-            before = self.response.shift
-            self.response.shift = self._bank.correction(report)
-            self._new_bias = {n: b for n, b in self.response.shift.items() if b != before.get(n, 0.0)}
+            self._faulty = self._bank.faulty(report, self._removal.name)
+            self._declared = self._bank.correction(report)
 
-    def undo(self, log: NavigatorLog | NormalPoints | None) -> np.ndarray | None:
-        """What a bias that was just identified has done to the filter's state since its onset, with the sign reversed.
+    def remove(self, log: NavigatorLog | NormalPoints | None, replaced: bool) -> Removal:
+        """What the filter must do about the satellite that the bank accuses; without a filter its declared bias is taken off.
 
-        Onset by cumulative sum: the epoch from which the log-likelihood ratio to now, sum of mu (W r)_i - mu^2 W_ii / 2,
-        is largest. The state it polluted follows c <- (I - K H) phi c + K_i (mu - what was taken off, or undone, already).
+        ``replaced``: the filter takes another's state now.
         """
-        if not self._new_bias or log is None or log.count == 0:
-            return None
-        (name, mu), self._new_bias = next(iter(self._new_bias.items())), {}
-        if name not in log.names:
-            return None
-        ratio = []
-        for names, wr, w in reversed(self._scores(min(log.count, log.length))):
-            at = names.index(name) if name in names else -1
-            ratio.append(mu * wr[at] - 0.5 * mu * mu * w[at] if at >= 0 else 0.0)
-        age = 1 + int(np.argmax(np.cumsum(ratio)))
-        part, row = log.log(age), log.names.index(name)
-        c = np.zeros(log.dx.size)
-        for e, (*_, taken) in enumerate(self._past[-age:]):
-            left, taken[name] = mu - taken.get(name, 0.0), mu
-            c = part.phi[e] @ c if e else c
-            c = c + part.k[e] @ ((np.arange(part.r.shape[1]) == row) * left * part.used[e] - part.h[e] @ c)
-        return -c
+        if not self.response.spec.bias:
+            return Removal(self.response.shift)
+        if replaced:
+            self._removal.forget()
+        if log is None or log.count == 0:
+            self.response.shift = self._declared
+            return Removal(self.response.shift)
+        removal = self._removal(log, self._faulty, self.response.shift)
+        self.response.shift = removal.shift
+        return removal
 
     # -- protection levels --------------------------------------------------------------------------------------------
 
@@ -232,6 +227,14 @@ class BiasTracker:
         best = int(biased[np.argmax(report.probability[biased])])
         value = float(report.probability[best]) if report.fits or report.best != best else 0.0
         return self.names[int(report.row[best])], value, float(report.bias_m[best])
+
+    def faulty(self, report: BiasReport, before: str | None) -> str | None:
+        """The satellite that is biased by whatever size, as probable as ``declare`` wants; ``before`` stays while it is likelier than not."""
+        of = np.bincount(report.row, np.where(report.bias_m != 0, report.probability, 0.0), len(self.names))
+        top = int(np.argmax(of))
+        if of[top] >= self.spec.declare and report.fits:
+            return self.names[top]
+        return before if before in self.names and of[self.names.index(before)] > 0.5 else None
 
     def correction(self, report: BiasReport) -> dict[str, float]:
         """Declared biases by name."""

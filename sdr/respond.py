@@ -39,7 +39,7 @@ class RespondSpec(BaseModel):
     noise: Literal["als", "noise_rmd"] | None = None
     """Range variances come from this estimator."""
     bias: bool = False
-    """Subtract a bias that was identified."""
+    """Take an offset that was identified off its range and off the filter's state, and add its uncertainty to the claim."""
     exclude: tuple[Literal["innovation", "raim", "parallel_filters"], ...] = ()
     """Leave out satellites that these monitors accuse."""
     reset: bool = False
@@ -121,7 +121,7 @@ class Response:
         """Biases taken off the ranges of ``names``, m."""
         return np.array([self.shift.get(n, 0.0) for n in names]) if self.shift else np.zeros(len(names))
 
-    def answer(self, snap: Snapshot | None, t_s: float, dx, p) -> Remedy | None:
+    def answer(self, snap: Snapshot | None, t_s: float, dx, p, extra=None) -> Remedy | None:
         """The remedy of the next epoch; None while nothing may act."""
         if self.spec.off:
             return None
@@ -141,7 +141,7 @@ class Response:
                 self.scale[name] * own[name] if name in self.scale and name in own else np.nan
             )
             row["bias_m"], row["exclude"] = self.shift.get(name, 0.0), name in out
-        return Remedy(rows, dx, p)
+        return Remedy(rows, dx, p, extra)
 
 
 def rows_of(remedy: Remedy, sample: int, t_s: float) -> np.ndarray:

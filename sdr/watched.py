@@ -165,9 +165,10 @@ class SteeringWatch:
     def hand(self, remedy: Remedy) -> Remedy:
         """A new state or covariance is taken at once, between two epochs; the rest by ``Steering.heed``."""
         self.filter.correct(remedy.dx, remedy.p)
+        self.filter.extra = remedy.extra
         if remedy.p is not None:
             self.points.restart(remedy.p)
-        return remedy._replace(dx=None, p=None)
+        return remedy._replace(dx=None, p=None, extra=None)
 
 
 Watched = NavigatorWatch | SteeringWatch

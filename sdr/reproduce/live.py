@@ -36,9 +36,10 @@ FS_HZ, T_S, PER_LOOK, N, RATE_MPS = 1e6, 0.02, 10, 10, 0.1
 
 
 class Twin:
-    """A steering filter at rest under five GPS and five Galileo satellites, on discriminators of known noise, without samples.
+    """A steering filter under five GPS and five Galileo satellites, on discriminators of known noise, without samples.
 
-    Position, velocity and clock at 50 Hz; ``step`` is one epoch as `Steering` does it. ``claimed_m`` is the range noise that the
+    Position, velocity and clock at 50 Hz, wandering with the process noise that the filter believes, so that its claims are
+    exact while nothing is wrong; ``step`` is one epoch as `Steering` does it. ``claimed_m`` is the range noise that the
     filter believes, ``sigma_m`` the true one, scalars or (N,).
     """
 
@@ -61,7 +62,16 @@ class Twin:
         self.active, self.inflate, self.bias = np.arange(SLOTS) < N, np.ones(2 * SLOTS), np.zeros(SLOTS)
         self.name = [("L1CA" if k < N // 2 else "E1C", k + 1) if k < N else None for k in range(SLOTS)]
         self._q, self._f = extended_q(model, x), np.zeros_like(f.p)
+        self._wind, self._spare = np.random.default_rng([seed, 1]), np.zeros((3, *f.p.shape))
         self._maps = np.empty((3, f.p.shape[0])), np.empty((3, f.p.shape[0]))
+
+    def _wander(self, qd):
+        """The truth moves on, with noise of covariance ``qd``."""
+        p, phi, unused = self._spare
+        kernels.predict(
+            3, self.truth, p, np.zeros((1, 7)), T_S, 1.0, np.zeros(3), self._q, self._f, phi, unused
+        )
+        kernels.inject(3, self.truth, np.linalg.cholesky(qd) @ self._wind.standard_normal(len(qd)))
 
     def step(self, fault_m=None):
         """One epoch, with ``fault_m`` (N,) on the ranges."""
@@ -82,6 +92,7 @@ class Twin:
             log.phi,
             log.qd,
         )
+        self._wander(log.qd)
         h[:] = 0.0
         kernels.rows(3, f.x, f.p.shape[0], f.los, self.second, ones, ones, *self._maps, h)
         h[N:SLOTS] = h[SLOTS + N :] = 0.0
@@ -122,7 +133,7 @@ def fly(monitors, respond=None, seconds=30.0, sigma_m=5.0, fault=None, seed=1, c
         f = sky.filter
         error = (sky.truth - f.x)[:3]
         part = f.n_rows - 2 * int(np.sum(sky.inflate[:N] >= LEFT_OUT))
-        track[:, k] = np.linalg.norm(error), f.nis / part, error @ np.linalg.solve(f.p[:3, :3], error)
+        track[:, k] = np.linalg.norm(error), f.nis / part, error @ np.linalg.solve(f.covariance(), error)
         if run is None:
             continue
         run.gather(sky)
@@ -195,7 +206,7 @@ def fly_cell(cell: Cell, seed: int) -> dict[str, Any]:
             monitors, respond, FLIGHT_S, shape, fault, seed, BELIEVED_M if alone else shape
         )
         error, nis, nees = track[:, -round(TAIL_S / T_S) :]
-        claimed = float(np.sqrt(np.trace(sky.filter.p[:3, :3])))
+        claimed = float(np.sqrt(np.trace(sky.filter.covariance())))
         out[name] = {
             "error_m": float(np.sqrt(np.mean(error**2))), "claimed_m": claimed, "nees": float(nees.mean()),
             "nis": float(nis.mean()), **alarms(run, suspect, FAULT_S),
