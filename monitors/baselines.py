@@ -33,6 +33,12 @@ class _Moments:
 
     def __init__(self, name):
         self.name, self.count, self.mean, self._m2 = name, 0, 0.0, 0.0
+        self.least_spread = 0.0
+
+    @property
+    def spread(self):
+        """Standard deviation in training."""
+        return math.sqrt(self._m2 / (self.count - 1)) if self.count > 1 else math.nan
 
     def add(self, x):
         x = np.asarray(x, float)
@@ -46,7 +52,7 @@ class _Moments:
     def standardise(self, x):
         if self.count < 2:
             raise ValueError(f"the {self.name} monitor is not trained: call train with quiet data first")
-        return (x - self.mean) / math.sqrt(self._m2 / (self.count - 1))
+        return (x - self.mean) / max(self.spread, self.least_spread)
 
 
 class _Restart:
@@ -72,6 +78,20 @@ class _WindowRun(_Restart):
         self.moments = _Moments(name)
         self.epoch = 0
         self._rest = np.zeros((0, n_taps), np.complex64)
+
+    @property
+    def spread(self):
+        """Standard deviation of the quantity in training, in its own unit."""
+        return self.moments.spread
+
+    @property
+    def least_spread(self):
+        """Least standard deviation that standardises: a short training may have met too few fades."""
+        return self.moments.least_spread
+
+    @least_spread.setter
+    def least_spread(self, value):
+        self.moments.least_spread = value
 
     def values(self, corr):
         """Quantity of each whole window of complex64 (n, K), float64."""

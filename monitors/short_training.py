@@ -28,10 +28,10 @@ def independent_values(values):
     return len(x) * (1 - r) / (1 + r) if r > 2 / math.sqrt(len(x)) else float(len(x))
 
 
-def _check(n, what):
+def _check(n, remedy):
     if n < LEAST_VALUES:
         raise ValueError(
-            f"{n:.1f} independent {what} are too few for a threshold, at least {LEAST_VALUES} are needed"
+            f"{n:.1f} independent training values are too few for a threshold, at least {LEAST_VALUES} are needed: {remedy}"
         )
 
 
@@ -51,7 +51,7 @@ class StudentNull:
     def fit(cls, values, two_sided=False, rise=0.0):
         """From the training's own values, in time order; ``rise``, in their unit, is allowed for besides."""
         n = independent_values(values)
-        _check(n, "training values")
+        _check(n, "lengthen training_s, or give expect_multipath where the signal fades")
         return cls(n, two_sided, rise / max(float(np.std(values, ddof=1)), 1e-12))
 
     def sf(self, x):
@@ -91,7 +91,7 @@ class FisherNull:
         """From the training's own values, in time order; independent data have ``most_degrees``."""
         x = np.asarray(values, float)
         n = independent_values(x)
-        _check(n, "training values")
+        _check(n, "lengthen training_s")
         return cls(float(x.mean()), float(min(2 * x.mean() ** 2 / x.var(ddof=1), most_degrees)), n)
 
     def sf(self, x):

@@ -56,7 +56,7 @@ class WatchSpec(BaseModel):
     threshold: float | None = None
     """Threshold given outright, instead of by ``p_fa``."""
     expect_multipath: MultipathSpec | None = None
-    """Echoes that must not alarm (FFT and AR)."""
+    """Echoes that must not alarm, of all satellites; not needed for the GLRT, which is blind to them."""
     noise_rise_db: float = Field(0.3, ge=0, le=10)
     """Rise of the correlators' noise that must not alarm (GLRT, AR, noise floor, C/N0): other satellites' codes that come
     into step."""

@@ -1,10 +1,15 @@
 """Thresholds of the live monitors: null models of statistics that a training of seconds has standardised.
 
 A P_FA of 1e-5 needs a million quiet epochs, a channel has twenty quiet seconds. The GLRT's null is analytic. For the
-FFT and the AR monitor the twin *rehearses*: it lives through the same training many times over, each time with
-another satellite, at the channel's own C/N0 and under the echoes that are to be expected; what it shows afterwards,
-the errors of a short training included, is the null. Its seeds are no scenario's. The others take the tail that
-theory gives to the few windows of their training: Student's t, Fisher's F.
+FFT and the AR monitor, and for every other one on the channels that is told which echoes to expect, the twin
+*rehearses*: it lives through the same training many times over, each time with another satellite, at the channel's own
+C/N0 and under those echoes; what it shows afterwards, the errors of a short training included, is the null. Its seeds
+are no scenario's. Without echoes the others take the tail that theory gives to the few windows of their training:
+Student's t, Fisher's F.
+
+Fades of 0.1 Hz leave two or three independent values in twenty seconds. A standard deviation of so few has the tail of
+Student's t: one channel in twenty would get a threshold far too low. So what the rehearsals spread by on average is the
+least that a statistic is standardised by (``least_spread``); the training finds the level, and can only widen it.
 """
 
 import contextlib
@@ -16,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from monitors.baselines import SignalQuality
+from monitors.baselines import Cn0Drop, NoiseFloor, SignalQuality
 from monitors.fft import FftMonitor
 from monitors.glrt import GlrtMonitor
 from monitors.multichannel_ar import MultichannelAr
@@ -24,12 +29,12 @@ from monitors.short_training import StudentNull
 from monitors.threshold import ParetoNull
 from tracking.correlator_model import Twin
 
-REHEARSALS = 120
-"""Trainings that the twin goes through for one threshold."""
+REHEARSALS, REHEARSALS_AR = 240, 120
+"""Trainings that the twin goes through for one threshold; the AR model costs most and standardises nothing."""
 TEST_S = 100.0
-"""Quiet time after each training: a fade has to come and go."""
-TAIL = {"FFT": 0.005, "AR": 0.05}
-"""Share of the rehearsed values that the tail is fitted to; the AR monitor gives fewer."""
+"""Quiet time after each training: a fade has to come and go, and an aircraft to sink until the echoes have changed."""
+TAIL, TAIL_AR = 0.01, 0.05
+"""Share of the rehearsed values that the tail is fitted to, or more where a fit needs it; the AR model's windows overlap."""
 WINDOW_STEPS = 5
 """Steps that a window of the AR monitor is moved by its own length in; windows further apart count as independent."""
 CN0_STEP_DB = 2
@@ -51,17 +56,28 @@ def null_of(channel: Any, corr: np.ndarray) -> Any:
     if isinstance(detector, GlrtMonitor):
         bins = _effective_bins(detector, tuple(channel.taps), channel.epoch_s, channel.signal, channel.prn)
         return GlrtNull(channel.run, bins, rise)
-    if isinstance(detector, FftMonitor | MultichannelAr):
-        cn0 = min(max(CN0_STEP_DB * round(channel.cn0_dbhz / CN0_STEP_DB), 20), 70)
-        n_train = -(-len(corr) // 50) * 50  # so that channels share what they can
-        tail = _rehearse(
-            detector, tuple(channel.taps), channel.epoch_s, channel.signal, channel.waveform, cn0, n_train,
-            channel.spec.expect_multipath,
-        )  # fmt: skip
-        return RehearsedNull(tail, math.log(rise) if isinstance(detector, MultichannelAr) else 0.0)
+    if channel.spec.expect_multipath is not None or isinstance(detector, FftMonitor | MultichannelAr):
+        return _rehearsed(channel, len(corr))
     if isinstance(detector, SignalQuality):
         return StudentNull.fit(channel.run.values(corr), two_sided=True)
     return StudentNull.fit(channel.run.values(corr), rise=channel.spec.noise_rise_db)
+
+
+def _rehearsed(channel: Any, n_train: int) -> "RehearsedNull":
+    """Null of rehearsals; tells the run the spread that they had."""
+    spec, run = channel.spec, channel.run
+    detector = spec.detector
+    cn0 = min(max(CN0_STEP_DB * round(channel.cn0_dbhz / CN0_STEP_DB), 20), 70)
+    n_train = -(-n_train // 50) * 50  # so that channels share what they can
+    tail, least_spread = _rehearse(
+        detector, tuple(channel.taps), channel.epoch_s, channel.signal, channel.waveform, cn0, n_train,
+        spec.expect_multipath,
+    )  # fmt: skip
+    if isinstance(detector, MultichannelAr):
+        return RehearsedNull(tail, 0.1 * math.log(10) * spec.noise_rise_db)
+    run.least_spread = least_spread
+    in_db = isinstance(detector, Cn0Drop | NoiseFloor)
+    return RehearsedNull(tail, spec.noise_rise_db / max(run.spread, least_spread) if in_db else 0.0)
 
 
 @dataclass(frozen=True)
@@ -111,16 +127,19 @@ def _effective_bins(detector: Any, taps: tuple, epoch_s: float, signal: str, prn
 def _rehearse(
     detector: Any, taps: tuple, epoch_s: float, signal: str, waveform: str | None, cn0_dbhz: float, n_train: int,
     multipath: Any,
-) -> ParetoNull:  # fmt: skip
-    """Null of a statistic after a training of ``n_train`` epochs: many quiet twins, each trained and then tested."""
-    overlap = 1.0
-    if isinstance(detector, MultichannelAr):
-        overlap = 1 / WINDOW_STEPS
+) -> tuple[ParetoNull, float]:  # fmt: skip
+    """Null of a statistic after a training of ``n_train`` epochs, and the spread that standardised it at least.
+
+    Many quiet twins, each trained and then tested.
+    """
+    overlap, rehearsals, tail, is_ar = 1.0, REHEARSALS, TAIL, isinstance(detector, MultichannelAr)
+    if is_ar:
+        overlap, rehearsals, tail = 1 / WINDOW_STEPS, REHEARSALS_AR, TAIL_AR
         detector = detector.model_copy(update={"hop_s": detector.window_s * overlap})
     n_test = max(round(TEST_S / epoch_s), n_train)
-    values = []
+    values, spreads = [], []
     with one_blas_thread():
-        for trial in range(REHEARSALS):
+        for trial in range(rehearsals):
             prn = PRNS[trial % len(PRNS)]
             twin = Twin(
                 signal=signal, prn=prn, waveform=waveform, cn0_dbhz=cn0_dbhz, integration_s=epoch_s,
@@ -130,8 +149,14 @@ def _rehearse(
             run = detector.start(np.array(taps), epoch_s, signal, prn, waveform)
             run.train(corr[:n_train])
             values.append(run(corr[n_train:])["value"])
+            spreads.append(getattr(run, "spread", 1.0))
+    least_spread = 0.0
+    if not is_ar:
+        least_spread = math.sqrt(np.mean([np.mean(v**2) * s**2 for v, s in zip(values, spreads)]))
+        values = [v * (s / max(s, least_spread)) for v, s in zip(values, spreads)]
     pooled = np.concatenate(values)
-    return ParetoNull.fit(pooled, TAIL[detector.kind], n_effective=overlap * len(pooled))
+    tail = max(tail, min(0.1, 220 / len(pooled)))
+    return ParetoNull.fit(pooled, tail, n_effective=overlap * len(pooled)), least_spread
 
 
 @lru_cache(maxsize=1)

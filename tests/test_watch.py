@@ -8,11 +8,13 @@ import h5py
 import numpy as np
 import pytest
 
+from monitors.detection import cluster_rate
 from nav.navlog import REMEDY, Remedy
 from sdr import jobs, scenario
 from sdr.scenario import ReceiverSpec
 from sdr.watch import Flags, WatchSpec
 from sdr.watch_front import Overheard
+from sdr.watch_null import REHEARSALS, null_of
 from sdr.watch_post import MONITOR, poisson_interval, report_lines, totals
 from signals.modulation import SIGNALS
 from tracking.channel import STATE_LOCKED
@@ -102,6 +104,45 @@ def test_thresholds_deliver_their_p_fa():
             hits += np.count_nonzero(rows["value"] >= watch.posts[0].threshold)
         due = 1e-3 * tests
         assert abs(hits - due) < 5 * np.sqrt(due) + 1, (detector, hits, due)
+
+
+def test_a_training_that_met_few_fades_delivers_its_p_fa():
+    """Fades of 0.1 Hz: 20 s hold two or three. The rate over many channels is P_FA, within five deviations of trials
+    that hang together by channel, in the test and in the rehearsals. Without the least spread there would be twice as many.
+    """
+    p_fa, n_train, n_test, channels = 5e-3, 1000, 1000, 240
+    taps = 0.65 * (np.arange(35) - 17)
+    spec = WatchSpec(name="w", detector={"kind": "FFT"}, expect_multipath={"kind": "Aeronautical"})
+    hits, plain = np.zeros(channels, int), np.zeros(channels, int)
+    for i in range(channels):
+        twin = Twin(
+            signal="L1CA", prn=6, cn0_dbhz=42.0, integration_s=0.02, taps_chips=tuple(taps),
+            multipath=spec.expect_multipath,
+        )  # fmt: skip
+        corr = twin.start_open(np.random.SeedSequence(4, spawn_key=(i,)))(n_train + n_test)
+        run = spec.detector.start(taps, 0.02)
+        run.train(corr[:n_train])
+        post = SimpleNamespace(
+            spec=spec, run=run, taps=taps, epoch_s=0.02, signal="L1CA", prn=6, waveform=None, cn0_dbhz=42.0
+        )
+        limit = null_of(post, corr[:n_train]).isf(p_fa)
+        assert run.std >= run.least_spread * run.mean > 0
+        hits[i] = np.count_nonzero(run(corr[n_train:])["value"] >= limit)
+        run.least_spread = 0.0
+        plain[i] = np.count_nonzero(run(corr[n_train:])["value"] >= limit)
+    n = np.full(channels, n_test)
+    told = cluster_rate(hits, n, 0)
+    sigma = math.sqrt(p_fa / told.n_effective * (1 + channels / REHEARSALS))
+    assert abs(told.p - p_fa) < 5 * sigma < 2 * p_fa, (told, sigma)
+    assert plain.sum() > 2 * told.k, plain.sum()
+
+
+def test_expected_echoes_need_no_independent_training_values():
+    """A window of 10 s has two values in its training: too few by theory, enough with what the twin rehearsed."""
+    settings = {"seconds": 60.0, "expect_multipath": {"kind": "Aeronautical"}}
+    watch, rows = watched({"kind": "CN0", "window_s": 10.0}, **settings)
+    (report,) = watch.report(math.inf)
+    assert report["rule"] == "rehearsed" and len(rows) == 3 and not report["alarms"]
 
 
 def test_slabs_do_not_matter():
