@@ -357,13 +357,14 @@ def _store_theory(store: Store, receiver: Receiver) -> None:
     for (signal, prn), c in receiver.channel_of.items():
         loops = receiver.spec.tracking.l1ca if signal == "L1CA" else receiver.spec.tracking.e1
         t_s, cn0 = loops.integration_ms * 1e-3, float(replica["cn0_dbhz"][c])
+        now, space = receiver.tracker.channels[c], loops.early_late_space_chips
         if not np.isfinite(cn0) or cn0 < 10.0:
             continue
         store.append(
             f"tracking/{SYSTEM_LETTER[signal]}{prn:02d}_{signal}/epochs",
             np.empty(0),
-            phase_sigma_cycles=pll_jitter_cycles(cn0, loops.pll_bw_hz, t_s),
-            code_sigma_m=293.05 * dll_jitter_chips(cn0, loops.dll_bw_hz, t_s, loops.early_late_space_chips),
+            phase_sigma_cycles=pll_jitter_cycles(cn0, now["pll_bw_hz"], t_s),
+            code_sigma_m=293.05 * dll_jitter_chips(cn0, now["dll_bw_hz"], t_s, space),
         )
 
 

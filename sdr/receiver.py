@@ -94,6 +94,7 @@ class Receiver:
         self.navigator = spec.navigation.start(source.fs_hz)
         self.steering = self._start_steering(sensors)
         self._aiding: np.ndarray | None = None
+        self._adapts = any(loops.adapt is not None for loops in (spec.tracking.l1ca, spec.tracking.e1))
         respond = spec.respond
         self.flags = Flags(respond.weaken, respond.weaken_by, respond.hold_s, self.fs_hz)
         self.integrity = spec.integrity.start(spec.respond, self.fs_hz) if spec.integrity else None
@@ -348,11 +349,26 @@ class Receiver:
 
     def _commands(self) -> np.ndarray | None:
         """AIDING of the slab that begins: what navigation left at the last one's end, for new channels nothing."""
-        if self._aiding is None:
+        heeds = self._adapts and (not self.spec.respond.off or bool(self.flags.names))
+        if self._aiding is None and not heeds:
             return None
         commands = np.zeros(len(self.tracker.channels), AIDING)
-        commands[: len(self._aiding)] = self._aiding
+        if self._aiding is not None:
+            commands[: len(self._aiding)] = self._aiding
+        if heeds:
+            self._weaken(commands)
         return commands
+
+    def _weaken(self, commands: np.ndarray) -> None:
+        """Tell the loops whose bandwidths follow the noise what the monitors ask for."""
+        remedy, snap = self._remedy(self.position), self.navigator.snapshot
+        own = {} if snap is None else dict(zip(snap.names, snap.own_m2))
+        for row in () if remedy is None else remedy.rows:
+            system, prn = row["system"].decode(), int(row["prn"])
+            c, own_m2 = self.channel_of.get((SEARCHED[system], prn)), own.get(f"{system}{prn:02d}", np.nan)
+            if c is not None:
+                noisier = row["variance_m2"] / own_m2
+                commands["weaken"][c] = max(row["weaken"], 1.0) * (noisier if noisier > 1.0 else 1.0)
 
     def _steer(self, sample: int, epochs: np.ndarray, counts: np.ndarray, out: Outcome) -> None:
         steering = self.steering

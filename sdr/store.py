@@ -29,6 +29,7 @@ UNITS = {
     "_deg_s": "deg/s",
     "_m2_s": "m^2/s",
     "_mps2": "m/s^2",
+    "_mps3": "m/s^3",
     "_ns": "ns",
     "_mg": "mg",
     "_mrad": "mrad",

@@ -13,7 +13,7 @@ from signals.modulation import BLOCK, SIGNALS, autocorrelation, chip_acf, code_t
 from tracking.discriminators import CARRIER_DISCRIMINATORS, CODE_DISCRIMINATORS, code_scale_chips
 from tracking.kernels import CHANNEL, HISTORY, KIND_CA, KIND_DATA, KIND_PILOT, SYMBOL, track_slab
 from tracking.lock import STATE_BIT_SYNC, STATE_IDLE, STATE_LOCKED, STATE_LOST, STATE_PULL_IN
-from tracking.loops import MAX_BT, dll_gains, fll_gain, pll_gains
+from tracking.loops import MAX_BT, adapted_gains, dll_gains, fll_gain, pll_gains
 from tracking.records import AIDING, EPOCH, REPLICA
 from tracking.vector_ir import HAS_INTEGER_PATH, LONGEST_MULTILEVEL
 
@@ -23,6 +23,7 @@ __all__ = [
     "STATE_LOCKED",
     "STATE_LOST",
     "STATE_PULL_IN",
+    "AdaptSpec",
     "E1Tracking",
     "L1caTracking",
     "TapsSpec",
@@ -57,6 +58,27 @@ class TapsSpec(BaseModel):
         return count
 
 
+class AdaptSpec(BaseModel):
+    """Loop bandwidths that follow the C/N0 of the last tenth of a second, down from ``pll_bw_hz`` and ``dll_bw_hz``.
+
+    Each loop takes the bandwidth at which noise and dynamic stress together are least (``tracking.loops``): about the 7th
+    root of C/N0 for the carrier, the 3rd for the code. What a monitor asks for (``receiver.respond``) counts as so
+    much more noise.
+    """
+
+    model_config = _FROZEN
+    jerk_mps3: float = Field(1.0, gt=0.0, le=1e4)
+    """Jerk along the line of sight that the carrier loop must bear."""
+    code_drift_mps: float = Field(0.1, gt=0.0, le=100.0)
+    """Rate at which the code may leave the carrier that aids it."""
+    pll_min_hz: float = Field(2.0, gt=0.0, le=100.0)
+    """Least noise bandwidth of the carrier loop."""
+    dll_min_hz: float = Field(0.05, gt=0.0, le=10.0)
+    """Least noise bandwidth of the code loop."""
+    cn0_s: float = Field(0.1, ge=0.02, le=10.0)
+    """Time constant of the C/N0 that they follow."""
+
+
 class _Loops(BaseModel):
     """Loop settings that both signals share. Bandwidths are one-sided noise bandwidths."""
 
@@ -77,11 +99,25 @@ class _Loops(BaseModel):
     """Code discriminator."""
     taps: TapsSpec | None = None
     """Window of additional correlator taps; unset: E, P, L alone."""
+    adapt: AdaptSpec | None = None
+    """Bandwidths follow the noise; unset: they are fixed."""
 
     def _check(self, T_s):
+        if self.adapt is not None:
+            self._check_adapt(self.adapt)
         pll_gains(self.pll_order, self.pll_bw_hz, T_s)
         dll_gains(self.dll_order, self.dll_bw_hz, T_s)
         fll_gain(self.fll_bw_hz, T_s)
+
+    def _check_adapt(self, adapt):
+        if (self.pll_order, self.dll_order) != (3, 1):
+            raise ValueError("adapt is made for pll_order = 3 and dll_order = 1: leave them as they are")
+        for key in ("pll", "dll"):
+            least, greatest = getattr(adapt, f"{key}_min_hz"), getattr(self, f"{key}_bw_hz")
+            if least > greatest:
+                raise ValueError(
+                    f"adapt.{key}_min_hz = {least:g} lies above {key}_bw_hz = {greatest:g}: swap them"
+                )
 
 
 class L1caTracking(_Loops):
@@ -113,6 +149,12 @@ class E1Tracking(_Loops):
     """Coherent integration."""
     replica: Literal["BOC11", "CBOC"] = "BOC11"
     """Waveform of the replica."""
+    early_late_space_chips: float = Field(
+        default_factory=lambda data: 0.1 if data.get("replica") == "CBOC" else 0.25, gt=0.0, lt=0.6
+    )
+    """Whole spacing between early and late; 0.1 with a CBOC replica, whose peak has no slope at 0.25."""
+    very_early_late_space_chips: float = Field(1.0, ge=0.8, le=1.2)
+    """Whole spacing between very early and very late."""
     side_peak_protection: bool = True
     """Jump back when a side peak of the BOC correlation is tracked."""
 
@@ -149,12 +191,6 @@ class TrackingSpec(BaseModel):
     """Carrier-lock indicator from which a channel counts as locked."""
     lock_out: float = Field(0.4, gt=-1.0, lt=1.0)
     """Carrier-lock indicator below which it no longer does."""
-    early_late_space_chips: float = Field(
-        default_factory=lambda data: 0.1 if data.get("replica") == "CBOC" else 0.25, gt=0.0, lt=0.6
-    )
-    """Whole spacing between early and late; 0.1 with a CBOC replica, whose peak has no slope at 0.25."""
-    very_early_late_space_chips: float = Field(1.0, ge=0.8, le=1.2)
-    """Whole spacing between very early and very late."""
     lost_after_s: float = Field(1.0, gt=0.0, le=600.0)
     """A channel without lock for this long is given up."""
     settle_s: float = Field(0.6, ge=0.2, le=10.0)
@@ -416,8 +452,21 @@ class Tracker:
         st["dll_track"] = dll_gains(loops.dll_order, loops.dll_bw_hz, T_s)
         st["fll_settle"] = fll_gain(spec.settle_fll_bw_hz, T_settle)
         st["fll_track"] = fll_gain(loops.fll_bw_hz, T_s)
+        st["pll_bw_hz"], st["dll_bw_hz"] = loops.pll_bw_hz, loops.dll_bw_hz
+        if loops.adapt is not None:
+            self._assign_adaptation(st, loops, T_s)
         for name in ("cn0_window_s", "cn0_min_dbhz", "lock_in", "lock_out", "lost_after_s"):
             st[name] = getattr(spec, name)
+
+    @staticmethod
+    def _assign_adaptation(st, loops, T_s):
+        a, is_ca = loops.adapt, st["kind"] == KIND_CA
+        costas = st["carrier_code"] != CARRIER_DISCRIMINATORS["four_quadrant"]
+        st["adapt_s"] = a.cn0_s
+        st["adapted"] = adapted_gains(
+            (a.pll_min_hz, loops.pll_bw_hz), (a.dll_min_hz, loops.dll_bw_hz), loops.fll_bw_hz, T_s, bool(costas),
+            1.0 if is_ca else 3.0, loops.early_late_space_chips, a.jerk_mps3, a.code_drift_mps,
+        )  # fmt: skip
 
     # ------------------------------------------------------------------------------------------------ run
     def process(self, n0, iq, aiding=None):

@@ -37,6 +37,7 @@ from tracking.lock import (
     cn0_noise_reference_dbhz,
     code_lock,
 )
+from tracking.loops import ADAPT_LOW_DBHZ, ADAPT_ROWS
 
 __all__ = ["CHANNEL", "HISTORY", "SYMBOL", "track_slab"]
 
@@ -98,6 +99,8 @@ CHANNEL = np.dtype(
         ("dll_track", "f8", 2),
         ("fll_settle", "f8"),
         ("fll_track", "f8"),
+        ("adapt_s", "f8"),  # time constant of the C/N0 that the bandwidths follow; 0: they are fixed
+        ("adapted", "f8", (ADAPT_ROWS, 7)),  # their gains against C/N0 (tracking.loops.adapted_gains)
         ("cn0_window_s", "f8"),
         ("cn0_min_dbhz", "f8"),
         ("lock_in", "f8"),
@@ -116,6 +119,12 @@ CHANNEL = np.dtype(
         ("rate_hz", "f8"),
         ("rate_hz_s", "f8"),
         ("code_rate_chips_s", "f8"),
+        ("pll_bw_hz", "f8"),  # noise bandwidths now
+        ("dll_bw_hz", "f8"),
+        ("fast_prompt", "f8"),  # powers over the last adapt_s, and for how long
+        ("fast_noise", "f8"),
+        ("fast_s", "f8"),
+        ("weaken", "f8"),
         # The integration that is running.
         ("m_done", "i4"),
         ("m_total", "i4"),
@@ -126,6 +135,7 @@ CHANNEL = np.dtype(
         ("start_carrier_cycles", "f8"),
         ("start_doppler_hz", "f8"),
         ("rounding_sum", "f8"),
+        ("noise_sum", "f8"),  # |noise tap|^2 per sample, of each of its code periods
         ("second_i", "f8"),
         ("second_q", "f8"),
         ("data_i", "f8"),
@@ -150,6 +160,10 @@ CHANNEL = np.dtype(
         ("hist_sample", "i8"),
         ("attempts", "i4"),
         ("bit_energy", "f8", 20),
+        ("edges", "f8", 20),  # products of successive prompts of 1 ms by code period mod 20: least where bits change
+        ("edge_i", "f8"),
+        ("edge_q", "f8"),
+        ("edge_n", "i8"),
         (
             "symbol_phase",
             "i8",
@@ -387,6 +401,9 @@ def _close_loops(st, sample):
     st.code_rate_chips_s = 0.0
     st.symbol_m, st.symbol_n = 0, 0
     st.symbol_i = st.symbol_q = 0.0
+    st.edges[:] = 0.0
+    st.edge_i = st.edge_q = 0.0
+    st.edge_n = 0
     _reset_moments(st)
 
 
@@ -545,6 +562,7 @@ def _begin(st, command, fs_hz):
     else:
         st.doppler_rate_hz_s = 0.0
         st.steered = 0
+    st.weaken = max(command.weaken, 1.0)
     m = 1
     if st.state == STATE_LOCKED:
         m = st.m_settle if st.settling else st.m_track
@@ -554,7 +572,7 @@ def _begin(st, command, fs_hz):
     st.start_sample, st.start_period = st.next_sample, st.code_period
     st.start_code_chips, st.start_carrier_cycles = st.code_phase_chips, st.carrier_cycles
     st.start_doppler_hz = st.doppler_hz
-    st.rounding_sum = st.second_i = st.second_q = st.data_i = st.data_q = 0.0
+    st.rounding_sum = st.noise_sum = st.second_i = st.second_q = st.data_i = st.data_q = 0.0
 
 
 @njit(nogil=True)
@@ -673,6 +691,35 @@ def _steer(st, phase_error, freq_error, code_err, T_s):
 
 
 @njit(nogil=True)
+def _adapt(st, prompt_power, T_s):
+    """Loop gains of the C/N0 of the last ``adapt_s``, so much lower as monitors ask (``loops.adapted_gains``).
+
+    A strong signal that is gone, and noise five deviations above its mean, count at once.
+    """
+    st.fast_s += T_s
+    k = T_s / min(st.fast_s, st.adapt_s + T_s)
+    noise = st.noise_sum / (st.m_total * st.n_acc)
+    if prompt_power < 0.1 * st.fast_prompt and st.fast_prompt > 10.0 * st.fast_noise:
+        st.fast_prompt = prompt_power
+    if noise > (1.0 + 5.0 / math.sqrt(st.m_total)) * st.fast_noise:
+        st.fast_noise = noise
+    st.fast_prompt += k * (prompt_power - st.fast_prompt)
+    st.fast_noise += k * (noise - st.fast_noise)
+    snr = st.fast_prompt / max(st.fast_noise, 1e-30) - 1.0
+    y = 10.0 * math.log10(max(snr, 1e-9) / (T_s * st.weaken)) - ADAPT_LOW_DBHZ
+    y = min(max(y, 0.0), ADAPT_ROWS - 1.000001)
+    i = int(y)
+    w = y - i
+    low, high = st.adapted[i], st.adapted[i + 1]
+    for c in range(3):
+        st.pll_track[c] = (1.0 - w) * low[c] + w * high[c]
+    st.dll_track[0] = (1.0 - w) * low[3] + w * high[3]
+    st.fll_track = (1.0 - w) * low[4] + w * high[4]
+    st.pll_bw_hz = (1.0 - w) * low[5] + w * high[5]
+    st.dll_bw_hz = (1.0 - w) * low[6] + w * high[6]
+
+
+@njit(nogil=True)
 def _settle(st, T_s, fs_hz):
     """Narrow the carrier loop in stages, each with half the bandwidth of the one before.
 
@@ -753,6 +800,8 @@ def _finish(st, acc, hist, secondary, fs_hz, epoch, corr, symbols, count):
             st.rate_hz += st.rate_hz_s * T_s
             st.doppler_hz = st.rate_hz
         elif st.steered == 0 and st.state == STATE_LOCKED:
+            if st.adapt_s > 0.0:
+                _adapt(st, p.real**2 + p.imag**2, T_s)
             _steer(st, phase_error, freq_error, code_err, T_s)
             _false_frequency(st, i1, q1, i2, q2, T_s)
             if st.bump_n * T_s >= 0.1 and st.bump_n >= 4.0 and _bump_decision(st, 1.5):
@@ -804,7 +853,35 @@ def _finish(st, acc, hist, secondary, fs_hz, epoch, corr, symbols, count):
     epoch.carrier_lock = st.carrier_lock
     epoch.code_lock = st.code_lock
     epoch.cycle_slip = slip
+    if state == STATE_LOCKED and st.steered == 0 and st.settling == 0:
+        epoch.pll_bw_hz, epoch.dll_bw_hz = st.pll_bw_hz, st.dll_bw_hz
     return count
+
+
+@njit(nogil=True)
+def _watch_edges(st, i, q):
+    """Give a C/A channel up whose bits change at another code period than it believes: samples are missing.
+
+    The mean product of successive prompts is A^2 (1 - 2 p) where bits change, with p near 1/2, and A^2 elsewhere. Over
+    100 bits the least must be the expected one, but for half of A^2 and seven standard deviations of the others.
+    """
+    st.edges[st.code_period % 20] += i * st.edge_i + q * st.edge_q
+    st.edge_i, st.edge_q = i, q
+    st.edge_n += 1
+    if st.edge_n < 2000:
+        return
+    own, least, total, squares = st.edges[st.symbol_phase % 20], math.inf, 0.0, 0.0
+    for k in range(20):
+        least = min(least, st.edges[k])
+        total += st.edges[k]
+        squares += st.edges[k] * st.edges[k]
+    mean = (total - least) / 19.0
+    spread = math.sqrt(max((squares - least * least) / 19.0 - mean * mean, 0.0))
+    if own - least > 0.5 * mean + 7.0 * spread and st.steered == 0:
+        st.state = STATE_LOST
+        st.phase_locked = 0
+    st.edges[:] = 0.0
+    st.edge_n = 0
 
 
 @njit(nogil=True)
@@ -812,6 +889,8 @@ def _symbols(st, sums, n, start_sample, out, count):
     """Collect data symbols from one code period; returns the new count."""
     if st.state != STATE_LOCKED:
         return count
+    if st.kind == KIND_CA:
+        _watch_edges(st, sums[2 * st.prompt], sums[2 * st.prompt + 1])
     t = st.n_taps + 1 if st.kind == KIND_PILOT else st.prompt
     scale = st.data_scale if st.kind == KIND_PILOT else st.scale
     length = 20 if st.kind == KIND_CA else 1
@@ -852,7 +931,9 @@ def _accumulate(st, acc, sums, n, sign):
         st.data_q += sums[2 * st.n_taps + 3]
     noise_i, noise_q = sums[2 * st.n_taps] * st.scale, sums[2 * st.n_taps + 1] * st.scale
     _shift_window(st.noise_sums, max(4.0, 0.5 * st.cn0_window_s / st.period_s))
-    st.noise_sums[1, 0] += (noise_i * noise_i + noise_q * noise_q) / n
+    power = (noise_i * noise_i + noise_q * noise_q) / n
+    st.noise_sum += power
+    st.noise_sums[1, 0] += power
     st.noise_sums[1, 1] += 1.0
     if 2 * st.m_done + 1 == st.m_total:
         st.second_i += sign * sums[2 * n_sums]

@@ -10,6 +10,9 @@ and the phase at mid-interval advances by (f_k + f_{k+1}) T / 2. Third order: a 
 fourth pole r follows from the characteristic polynomial at w = z^-1 = -1: (1 + p)^3 (1 + r) = 8. Second
 order: K2 = K1^2 / 2 (damping 1/sqrt(2) in the continuous limit), because a double pole cannot reach B T =
 0.3.
+
+All of v, a and f are in units of time, not of integrations: gains may change from one integration to the next and
+the NCO goes on without a step.
 """
 
 import math
@@ -17,8 +20,14 @@ from functools import lru_cache
 
 import numpy as np
 
+from signals.constants import METRES_PER_CHIP, WAVELENGTH_M
+
 __all__ = [
+    "ADAPT_LOW_DBHZ",
     "MAX_BT",
+    "adapted_dll_bw_hz",
+    "adapted_gains",
+    "adapted_pll_bw_hz",
     "dll_gains",
     "dll_jitter_chips",
     "fll_gain",
@@ -127,6 +136,51 @@ def fll_gain(bw_hz, T_s):
         return 0.0
     _check_bt("FLL", bw_hz, T_s)
     return 4.0 * bw_hz * T_s / (1.0 + 2.0 * bw_hz * T_s)
+
+
+ADAPT_LOW_DBHZ, ADAPT_ROWS = 5, 61
+"""Grid of ``adapted_gains``: C/N0 from 5 to 65 dB-Hz, 1 dB apart."""
+_TRIPLE_POLE_BW = 33.0 / 32.0
+
+
+def adapted_pll_bw_hz(cn0_dbhz, T_s, jerk_mps3, costas=True):
+    """Noise bandwidth of the third-order carrier loop with the least sum of noise variance and squared dynamic stress.
+
+    sigma^2(B) + theta^2(B) = a B + (j (33/32)^3 / B^3)^2, a from ``pll_jitter_cycles``, theta = j / w^3 the lag under a
+    jerk of j cycles/s^3 of a loop with a triple pole at w = 32/33 B; so B = (6 c^2 / a)^(1/7) with c = j (33/32)^3. The
+    criterion is that of Jaffe & Rechtin (IRE Trans. Inf. Theory 1(1), 1955, noise plus weighted squared transient), the
+    terms are Kaplan & Hegarty's (section 5.6).
+    """
+    a = pll_jitter_cycles(cn0_dbhz, 1.0, T_s, costas) ** 2
+    c = jerk_mps3 / WAVELENGTH_M * _TRIPLE_POLE_BW**3
+    return (6.0 * c * c / a) ** (1.0 / 7.0)
+
+
+def adapted_dll_bw_hz(jitter_chips, drift_mps):
+    """The same for the first-order code loop: a B + (v / 4 B)^2 is least at B = (v^2 / (8 a))^(1/3).
+
+    ``jitter_chips``: ``dll_jitter_chips`` of 1 Hz; ``drift_mps``: rate v at which the code leaves the carrier that aids it.
+    """
+    v = drift_mps / METRES_PER_CHIP
+    return (v * v / (8.0 * jitter_chips**2)) ** (1.0 / 3.0)
+
+
+@lru_cache(maxsize=64)
+def adapted_gains(pll_hz, dll_hz, fll_hz, T_s, costas, slope, spacing_chips, jerk_mps3, drift_mps):
+    """Gains of the loops against C/N0, (ADAPT_ROWS, 7): K1, K2, K3, of the code loop, of the frequency aid, and both B.
+
+    ``pll_hz``, ``dll_hz``: (least, greatest) noise bandwidth, between which the laws above choose; the frequency aid, of
+    ``fll_hz`` at the greatest, keeps its share of the carrier loop's.
+    """
+    cn0 = ADAPT_LOW_DBHZ + np.arange(float(ADAPT_ROWS))
+    jitter = dll_jitter_chips(cn0, 1.0, T_s, spacing_chips, slope, 1.0 - slope * spacing_chips)
+    pll = np.clip(adapted_pll_bw_hz(cn0, T_s, jerk_mps3, costas), *pll_hz)
+    dll = np.clip(adapted_dll_bw_hz(jitter, drift_mps), *dll_hz)
+    rows = [
+        (*pll_gains(3, p, T_s), dll_gains(1, d, T_s)[0], fll_gain(fll_hz * p / pll_hz[1], T_s), p, d)
+        for p, d in zip(pll.tolist(), dll.tolist())
+    ]
+    return np.array(rows)
 
 
 def _check_bt(name, bw_hz, T_s):

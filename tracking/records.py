@@ -62,6 +62,8 @@ EPOCH = np.dtype(
         ("carrier_lock", "f4"),  # cos(2 phase error) average
         ("code_lock", "f4"),
         ("cycle_slip", "u1"),
+        ("pll_bw_hz", "f4"),  # noise bandwidths of the loops in force; 0: steered, pulling in or settling
+        ("dll_bw_hz", "f4"),
     ]
 )
 """One integration of one channel; the correlator array (C, n, K) complex64 travels beside it."""
@@ -73,6 +75,7 @@ AIDING = np.dtype(
         ("code_phase_chips", "f8"),  # wanted primary-code phase at sample_index
         ("doppler_hz", "f8"),
         ("doppler_rate_hz_s", "f8"),
+        ("weaken", "f8"),  # factor on the variances with which loops of its own adapt; below 1: none
     ]
 )
 """What navigation hands to tracking for the NEXT slab: stamped for the interval in which it is used."""
