@@ -1,10 +1,12 @@
 """Injection: jammers and echoes of a scenario added to a recording, with truth.
 
 The recording is scaled to unit noise per component, the jammers are added at their exact J/N0, and the sum goes through
-the gain control and the quantiser of the recording's own format (or of the scenario's, where it states another number
-of bits). The recording's power per component stands for its noise: satellites lie below it. J/S needs S, which is
-estimated by acquisition: its interval is reported. An echo is one of all that was recorded, noise included: a
-delayed copy of everything.
+the scenario's gain loop, if it has one, and a quantiser of the recording's own number of bits. The recording's power per
+component stands for its noise: satellites lie below it. J/S needs S, which is estimated by acquisition: its interval is
+reported. An echo is one of all that was recorded, noise included: a delayed copy of everything.
+
+Coarse levels are first spread over what they stand for (`Recorded`): what is weaker than a step would otherwise vanish
+in the second quantiser. The satellites go through two quantisers so (2 bits: twice 0.55 dB).
 """
 
 import math
@@ -29,6 +31,10 @@ if TYPE_CHECKING:
 SLAB = 1 << 18
 POWER_S = 1.0
 """The noise power is taken from so much of the recording's beginning."""
+SPREAD = 9
+"""Place of the spread's seed among those of the scenario."""
+STEP_S = 1e-3
+"""Delays and gains of echoes go in such steps."""
 HALF_TAPS = 24
 """Half length of the filter that delays by fractions of a sample."""
 BITS = {"ci1": 1, "ci2": 2, "ci2tc": 2, "raw8": 2, "ci8": 8, "cu8": 8, "ci16": 16, "cf32": 32}
@@ -53,20 +59,19 @@ def inject(
     if not source.complex:
         raise ValueError(f"'{file}' holds real samples: injection works on complex ones")
     base = output.with_suffix("") if output.suffix in (".sigmf-meta", ".sigmf-data", ".bin") else output
-    if Path(f"{base}.sigmf-data").resolve() == source.declared.data.resolve():
+    if source.declared.data.resolve() in {Path(f"{base}{end}").resolve() for end in (".sigmf-data", ".bin")}:
         raise ValueError(f"'{output}' is the recording itself: give another output")
-    noise_rms = _noise_rms(source, file)
+    recorded = Recorded(source, file, scenario._child(spec, SPREAD))
     satellites = _against(spec, source, file)
     duration_s = source.n_samples / source.fs_hz
     runs = _jammers(spec, source, duration_s, satellites)
-    echoes = (
-        None if spec.multipath is None else spec.multipath.start(scenario._child(spec, scenario.MULTIPATH))
-    )
+    echoes = _echoes(spec, duration_s)
     bits = BITS.get(source.format.name, 8)
     front = FrontEndSpec(
         fs_hz=source.fs_hz, if_hz=source.if_hz, bits=bits, agc=spec.front_end.agc if bits < 32 else None
     )
-    front_end = front.start(math.sqrt(1.0 + sum(r.rms**2 for r in runs)))
+    echo_power = 0.0 if echoes is None else float(echoes.power.sum())
+    front_end = front.start(math.sqrt(1.0 + echo_power + sum(r.rms**2 for r in runs)))
     extra = {"gnss:bits": bits, "gnss:injected": spec.name}
     annotations = [a for r in runs for a in r.annotations(source.fs_hz, source.n_samples)]
     fmt = {1: "ci1", 2: "ci2", 16: "ci16", 32: "cf32"}.get(bits, "ci8")
@@ -85,28 +90,69 @@ def inject(
         Store(truth_path, command="inject", scenario=text, seed=spec.seed) as store,
         _progress(spec.name, source.n_samples, quiet) as advance,
     ):
-        _stream(source, noise_rms, runs, echoes, front_end, writer, advance)
+        _stream(recorded, runs, echoes, front_end, writer, advance)
         index = np.arange(0, source.n_samples, max(round(0.1 * source.fs_hz), 1)).astype(np.uint64)
         for place, run in enumerate(runs):
             store.append("truth/jammers", run.truth(index, place))
         if echoes is not None:
-            gain, delay_s = echoes.series(0.0, 0.1, max(int(duration_s / 0.1), 1))
-            store.append("truth/echo_gain", np.ascontiguousarray(gain.T))
-            store.append("truth/echo_delay_s", np.ascontiguousarray(delay_s.T))
+            store.append("truth/echoes", echoes.truth(index, source.fs_hz))
     table = [_row(k, run, satellites, source.fs_hz) for k, run in enumerate(runs)]
     files = [str(p) for p in writer.files] + [str(truth_path)]
     return {
-        "files": files, "samples": writer.n_samples, "noise_rms_lsb": noise_rms, "jammers": table,
-        "text": "\n".join([*(_line(r) for r in table), *(f"  {f}" for f in files)]),
+        "files": files, "samples": writer.n_samples, "noise_rms_lsb": recorded.rms, "jammers": table,
+        "text": "\n".join([*(_line(r) for r in table), *_echo_lines(echoes), *(f"  {f}" for f in files)]),
     }  # fmt: skip
 
 
-def _noise_rms(source: Any, file: Path) -> float:
-    _, iq = source.read_at(0, min(round(POWER_S * source.fs_hz), source.n_samples))
-    rms = float(np.sqrt(np.mean(iq.astype(np.float64) ** 2)))
-    if rms == 0.0:
-        raise ValueError(f"'{file}' begins with {POWER_S:g} s of zeros: its noise level is not known")
-    return rms
+class Recorded:
+    """Run that reads a recording in units of its noise, as it was before its quantiser as far as that can be known.
+
+    A level of 1 or 2 bits becomes a draw from the part of a Gaussian that it stands for, by its share of POWER_S; one of
+    8 bits is spread evenly over its step. Draws belong to absolute samples. Wider formats stay as they are.
+    """
+
+    def __init__(self, source: Any, file: Path, seed: np.random.SeedSequence) -> None:
+        self.source, self.n_samples, self._seed = source, source.n_samples, seed
+        _, iq = source.read_at(0, min(round(POWER_S * source.fs_hz), source.n_samples))
+        self.rms = float(np.sqrt(np.mean(iq.astype(np.float64) ** 2)))
+        if self.rms == 0.0:
+            raise ValueError(f"'{file}' begins with {POWER_S:g} s of zeros: its noise level is not known")
+        self._levels = np.array(sorted(source.format.levels))
+        self._edges = np.append([np.mean(iq < level) for level in self._levels], 1.0)
+        self._coarse, self._spread = source.format.bits <= 2, source.format.bits <= 8
+        self._kept: dict[int, np.ndarray] = {}
+
+    def read(self, n0: int, n: int) -> np.ndarray:
+        """Samples n0 .., float32 (2, n); zeros before the first and after the last."""
+        begin, end = max(n0, 0), min(n0 + n, self.n_samples)
+        out = np.zeros((2, n), np.float32)
+        while begin < end:
+            block, at = divmod(begin, SLAB)
+            stop = min(end, (block + 1) * SLAB)
+            out[:, begin - n0 : stop - n0] = self._slab(block)[:, at : at + stop - begin]
+            begin = stop
+        return out
+
+    def _slab(self, block: int) -> np.ndarray:
+        """Samples of block ``block`` of SLAB; the last two that were asked for are kept."""
+        if block not in self._kept:
+            begin = block * SLAB
+            iq = self.source.read_at(begin, min(SLAB, self.n_samples - begin))[1]
+            seed = np.random.SeedSequence(self._seed.entropy, spawn_key=(*self._seed.spawn_key, block))
+            self._kept = dict([*self._kept.items()][-1:]) | {block: self._before_quantiser(iq, seed)}
+        return self._kept[block]
+
+    def _before_quantiser(self, iq: np.ndarray, seed: np.random.SeedSequence) -> np.ndarray:
+        if not self._spread:
+            return iq * np.float32(1.0 / self.rms)
+        u = np.random.Generator(np.random.Philox(seed)).random(iq.shape, np.float32)
+        if not self._coarse:
+            return (iq + (u - np.float32(0.5))) * np.float32(1.0 / self.rms)
+        from scipy.special import ndtri
+
+        k = np.searchsorted(self._levels, iq)
+        low, high = self._edges[k], self._edges[k + 1]
+        return ndtri(low + (u + 2.0**-25) * (high - low)).astype(np.float32)
 
 
 def _against(spec: Scenario, source: Any, file: Path) -> dict[str, tuple[float, float]]:
@@ -147,9 +193,20 @@ def _jammers(spec: Scenario, source: Any, duration_s: float, satellites: dict[st
     return scenario.jammers(copy, source.fs_hz, source.if_hz, True, None)
 
 
+def _echoes(spec: Scenario, duration_s: float) -> EchoRun | None:
+    if spec.multipath is None:
+        return None
+    if spec.multipath.satellites is not None:
+        raise ValueError(
+            "multipath.satellites: in a recording satellites are not apart, an echo is one of them all: leave it out"
+        )
+    run = spec.multipath.start(scenario._child(spec, scenario.MULTIPATH))
+    run.check(duration_s, STEP_S)
+    return run
+
+
 def _stream(
-    source: Any,
-    rms: float,
+    recorded: Recorded,
     runs: list[JammerRun],
     echoes: EchoRun | None,
     front_end: FrontEnd,
@@ -157,11 +214,11 @@ def _stream(
     advance: Any,
 ) -> None:
     n0 = 0
-    while n0 < source.n_samples:
-        n = min(SLAB, source.n_samples - n0)
-        iq = _read(source, n0, n, rms)
+    while n0 < recorded.n_samples:
+        n = min(SLAB, recorded.n_samples - n0)
+        iq = recorded.read(n0, n)
         if echoes is not None:
-            iq += _echo(source, n0, n, rms, echoes)
+            iq += _echo(recorded, n0, n, echoes)
         for run in runs:
             run.add(iq, n0)
         writer.write(front_end.push(iq) if front_end.streaming else front_end(iq))
@@ -169,37 +226,36 @@ def _stream(
         advance(n0)
 
 
-def _read(source: Any, n0: int, n: int, rms: float) -> np.ndarray:
-    """Samples n0 .. in units of the noise; zeros before the first and after the last."""
-    begin, end = max(n0, 0), min(n0 + n, source.n_samples)
-    out = np.zeros((2, n), np.float32)
-    if begin < end:
-        out[:, begin - n0 : end - n0] = source.read_at(begin, end - begin)[1] * np.float32(1.0 / rms)
-    return out
-
-
-def _echo(source: Any, n0: int, n: int, rms: float, echoes: EchoRun) -> np.ndarray:
-    """g(t) x(t - tau) of every echo, delays and gains in steps of 1 ms on an absolute grid, sinc interpolation."""
-    step = max(round(1e-3 * source.fs_hz), 1)
+def _echo(recorded: Recorded, n0: int, n: int, echoes: EchoRun) -> np.ndarray:
+    """g(t) x(t - tau) of every echo: delays hold and gains go in lines over STEP_S, on an absolute grid."""
+    fs_hz, if_hz = recorded.source.fs_hz, recorded.source.if_hz
+    step = max(round(STEP_S * fs_hz), 1)
     out = np.zeros(n, np.complex64)
-    first = n0 // step
-    gain, delay_s = echoes.series(
-        first * step / source.fs_hz, step / source.fs_hz, (n0 + n) // step - first + 2
-    )
+    first, step_s = n0 // step, step / fs_hz
+    gain, delay_s = echoes.series(first * step_s, step_s, (n0 + n) // step - first + 2)
+    # Without their Doppler the gains are slow; it comes back by the sample.
+    at = first * step_s + step_s * np.arange(gain.shape[1])
+    turns = np.mod(echoes.doppler_hz[:, None] * at, 1.0)
+    gain = gain * np.exp(-2j * np.pi * turns)
     for i in range(first, (n0 + n - 1) // step + 1):
         begin, end = max(i * step, n0), min((i + 1) * step, n0 + n)
         x = np.arange(begin, end) / step - i
         for k in range(echoes.n_echo):
-            delay = delay_s[k, i - first] * source.fs_hz
-            whole, part = divmod(delay, 1.0)
-            taps = np.sinc(np.arange(-HALF_TAPS, HALF_TAPS + 1) - part) * np.kaiser(2 * HALF_TAPS + 1, 6.0)
-            s = _read(source, begin - int(whole) - HALF_TAPS, end - begin + 2 * HALF_TAPS, rms)
-            late = np.convolve(s[0] + 1j * s[1], taps, "valid")
-            # The recorded carrier at the intermediate frequency turns with the delay; the gain holds all phase.
-            turn = np.exp(2j * np.pi * np.mod(source.if_hz * delay_s[k, i - first], 1.0))
+            late = _late(recorded, begin, end, delay_s[k, i - first] * fs_hz)
             a, b = gain[k, i - first], gain[k, i - first + 1]
-            out[begin - n0 : end - n0] += (a + (b - a) * x) * turn * late
+            # The recorded carrier at the intermediate frequency turns with the delay; the gain holds all phase.
+            turn = if_hz * delay_s[k, i - first]
+            spin = np.mod(echoes.doppler_hz[k] * np.arange(begin, end) / fs_hz + turn, 1.0)
+            out[begin - n0 : end - n0] += (a + (b - a) * x) * np.exp(2j * np.pi * spin) * late
     return np.stack([out.real, out.imag])
+
+
+def _late(recorded: Recorded, begin: int, end: int, delay: float) -> np.ndarray:
+    """The samples begin .. end - 1 as they were ``delay`` samples before, by sinc interpolation: complex."""
+    whole, part = divmod(delay, 1.0)
+    taps = np.sinc(np.arange(-HALF_TAPS, HALF_TAPS + 1) - part) * np.kaiser(2 * HALF_TAPS + 1, 6.0)
+    s = recorded.read(begin - int(whole) - HALF_TAPS, end - begin + 2 * HALF_TAPS)
+    return np.convolve(s[0] + 1j * s[1], taps, "valid")
 
 
 def _row(place: int, run: JammerRun, satellites: dict[str, Any], fs_hz: float) -> dict[str, Any]:
@@ -219,3 +275,12 @@ def _line(row: dict[str, Any]) -> str:
         low, high = row["js_db_95"]
         text += f", J/S {row['js_db']:.1f} dB (95 %: {low:.1f} to {high:.1f}) against {row['against']}"
     return text
+
+
+def _echo_lines(echoes: EchoRun | None) -> list[str]:
+    if echoes is None:
+        return []
+    return [
+        f"echo {k + 1}: {1e9 * delay_s:.1f} ns late at the start, {10 * math.log10(power):.1f} dB, of all that was recorded"
+        for k, (delay_s, power) in enumerate(zip(echoes.delay_s, echoes.power))
+    ]

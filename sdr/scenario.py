@@ -36,7 +36,7 @@ from signals.jammers import JammerRun, JammerSpec
 from signals.modulation import SIGNALS
 from signals.multipath import EchoRun, MultipathSpec
 from signals.sky import Sky, SkySpec
-from signals.source import SyntheticSource
+from signals.source import CELLS_PER_S, SyntheticSource
 from signals.trajectory import MotionSpec, Static
 from tracking.acquisition import AcquisitionSpec
 from tracking.channel import TrackingSpec
@@ -203,6 +203,11 @@ def jammers(spec: Scenario, fs_hz: float, if_hz: float, is_complex: bool, sky: S
     """The scenario's jammers, each with its own seed, in samples of this rate."""
     runs = []
     for k, one in enumerate(spec.jammer):
+        if one.start_s >= spec.duration_s:
+            raise ValueError(
+                f"jammer {k + 1} ({one.kind}): start_s = {one.start_s:g} is not before the end at {spec.duration_s:g} s:"
+                " start it earlier, make the run longer, or leave it out"
+            )
         try:
             seed = _child(spec, JAMMERS, k)
             runs.append(
@@ -223,7 +228,10 @@ def echoes(spec: Scenario, names: Sequence[str]) -> dict[str, EchoRun]:
         raise ValueError(
             f"multipath.satellites: {missing[0]} is not in the sky; there are {', '.join(names)}"
         )
-    return {n: spec.multipath.start(_child(spec, MULTIPATH, ord(n[0]), int(n[1:]))) for n in wanted}
+    runs = {n: spec.multipath.start(_child(spec, MULTIPATH, ord(n[0]), int(n[1:]))) for n in wanted}
+    for run in runs.values():
+        run.check(spec.duration_s, 1.0 / CELLS_PER_S)
+    return runs
 
 
 def _interferer(path: str, fs_hz: float) -> tuple[Callable[[int, int], np.ndarray], int]:

@@ -18,6 +18,7 @@ from numba import njit
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from signals.constants import C_MPS, WAVELENGTH_M
+from signals.records import ECHO_TRUTH
 
 __all__ = ["Aeronautical", "Echo", "EchoRun", "Echoes", "MultipathSpec", "echo_gain", "echo_series"]
 
@@ -230,6 +231,44 @@ class EchoRun:
     def n_echo(self):
         """Number of echoes."""
         return len(self.amplitude)
+
+    @property
+    def power(self):
+        """Mean power of each over that of the direct signal, while it is visible."""
+        return self.amplitude**2 * np.where(self.tone_hz.any(axis=1), 1.0, N_TONES)
+
+    def check(self, duration_s, step_s):
+        """Refuse what samples whose gains are lines between nodes ``step_s`` apart cannot follow.
+
+        Raises ValueError for an echo that would come before the direct path and for fading of more than 0.2 / step,
+        whose lines would lie 1 % below its amplitude in the mean.
+        """
+        last = self.delay_s + self.delay_rate_s_s * np.minimum(duration_s, self.repeat_s)
+        width_hz = 2.0 * np.abs(self.tone_hz).max(axis=1, initial=0.0)
+        for k in range(self.n_echo):
+            if last[k] < 0.0:
+                raise ValueError(
+                    f"echo {k + 1} would come before the direct path after {-self.delay_s[k] / self.delay_rate_s_s[k]:.4g} s:"
+                    " raise its delay_s or its delay_rate_s_s"
+                )
+            if width_hz[k] > 0.2 / step_s:
+                raise ValueError(
+                    f"echo {k + 1} fades over {width_hz[k]:.3g} Hz, samples follow {0.2 / step_s:g} Hz: lower its bandwidth"
+                )
+
+    def truth(self, sample_index, fs_hz, system=b"", prn=0):
+        """ECHO_TRUTH rows at these samples, by sample and echo; satellite 0 of no system: of all that arrives."""
+        rows = [np.zeros(0, ECHO_TRUTH)]
+        for i in np.atleast_1d(np.asarray(sample_index, np.uint64)):
+            gain, delay_s = self.series(i / fs_hz, 1.0, 1)
+            part = np.zeros(self.n_echo, ECHO_TRUTH)
+            part["sample_index"], part["t_s"], part["prn"], part["system"] = i, i / fs_hz, prn, system
+            part["echo"], part["delay_s"] = np.arange(self.n_echo), delay_s[:, 0]
+            part["phase_rad"] = np.angle(gain[:, 0])
+            with np.errstate(divide="ignore"):
+                part["power_db"] = 20 * np.log10(np.abs(gain[:, 0]))
+            rows.append(part)
+        return np.concatenate(rows)
 
     def series(self, t0_s, step_s, n):
         """Gains complex64 (n_echo, n) and excess delays in s, float64 (n_echo, n), at t0 + i step >= 0."""

@@ -119,7 +119,7 @@ ECHO_TRUTH = np.dtype(
     [
         ("sample_index", "u8"),
         ("t_s", "f8"),
-        ("prn", "i4"),
+        ("prn", "i4"),  # 0: all that was recorded, its echo being injected
         ("system", "S1"),
         ("echo", "i4"),  # place in the list of the satellite's echoes
         ("delay_s", "f8"),  # excess over the direct signal

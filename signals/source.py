@@ -185,20 +185,10 @@ class SyntheticSource:
 
     def echo_truth(self, sample_index) -> np.ndarray:
         """ECHO_TRUTH rows at these samples, by satellite and sample."""
-        index = np.atleast_1d(np.asarray(sample_index, np.uint64))
         rows = [np.zeros(0, ECHO_TRUTH)]
         for row, run in self.echoes.items():
             satellite = self.sky.satellites[row]
-            for i in index:
-                t_s = i / self.fs_hz
-                gain, delay_s = run.series(t_s, 1.0, 1)
-                part = np.zeros(run.n_echo, ECHO_TRUTH)
-                part["sample_index"], part["t_s"], part["prn"] = i, t_s, satellite.prn
-                part["system"], part["echo"] = satellite.system.encode(), np.arange(run.n_echo)
-                part["delay_s"], part["phase_rad"] = delay_s[:, 0], np.angle(gain[:, 0])
-                with np.errstate(divide="ignore"):
-                    part["power_db"] = 20 * np.log10(np.abs(gain[:, 0]))
-                rows.append(part)
+            rows.append(run.truth(sample_index, self.fs_hz, satellite.system.encode(), satellite.prn))
         return np.concatenate(rows)
 
     def agc_gain_db(self, sample_index) -> np.ndarray | None:
