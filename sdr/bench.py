@@ -16,12 +16,14 @@ from typing import Any
 import numba as nb
 import numpy as np
 
+from monitors.fft import FftMonitor
 from sdr import iffile, scenario
 from sdr.receiver import Receiver
-from sdr.watch import WatchSpec
+from sdr.watch import WatchSpec, one_blas_thread
 from signals.source import SyntheticSource
 from tracking.acquisition import AcquisitionSpec, acquire, slab_samples
 from tracking.channel import TrackingSpec
+from tracking.correlator_model import Twin
 
 FS_HZ = 4.0e6
 LUT = 1024
@@ -99,6 +101,14 @@ def bench(*, quick: bool = False, quiet: bool = False) -> dict[str, Any]:
         say(f"  {name:22s}{cost['satellites']:6.2f} satellites, {cost['noise']:5.2f} thermal generators")
     share = _median([_monitors() for _ in range(rounds)])
     say(f"  live monitors         {100 * share:6.1f} % of the tracking of 8 channels with 35 taps")
+    open_loop, closed_loop = (_median([_rate(job) for _ in range(rounds)]) for job in _twins())
+    say(
+        f"  twin, 35 taps         {open_loop / 1e6:6.2f} million epochs/s through the FFT, {closed_loop / 1e6:.2f} with loops"
+    )
+    front = _median([_rate(_front_end) for _ in range(rounds)])
+    say(
+        f"  front end, all stages {front / FS_HZ:6.1f} times real time at {FS_HZ / 1e6:g} Msps, with its synthesis"
+    )
     found_s = _median([_acquisition() for _ in range(rounds)])
     say(f"  acquisition 32 PRN    {found_s:6.3f} s")
     chain, compute = _chain(20.0 if quick else 60.0)
@@ -122,6 +132,9 @@ def bench(*, quick: bool = False, quiet: bool = False) -> dict[str, Any]:
         "jammer_cost_satellites": {name: cost["satellites"] for name, cost in costs.items()},
         "jammer_cost_noise": {name: cost["noise"] for name, cost in costs.items()},
         "monitors_share_of_tracking": share,
+        "twin_open_fft_epochs_s": open_loop,
+        "twin_closed_epochs_s": closed_loop,
+        "front_end_msps": front / 1e6,
         "acquire_32_prn_s": found_s,
         "threads_2_speedup": speedup,
         "integrity_share": shares,
@@ -291,6 +304,37 @@ def _jammer_costs(rounds: int) -> dict[str, dict[str, float]]:
         for key in sources
         if key not in ("", "one", "silent")
     }
+
+
+def _twins() -> tuple[Job, Job]:
+    """The twin of one C/A channel with 35 taps: open loop through the maximum of the FFT, and with its loops."""
+    spec = Twin(signal="L1CA", prn=6, cn0_dbhz=40.5, integration_s=0.02)
+    source, loops = spec.start_open(1), spec.start(1)
+    monitor = FftMonitor().start(spec.tap_array_chips, spec.integration_s)
+    size = source.block_epochs
+
+    def timed(work: Callable[[int], Any], blocks: int) -> tuple[float, float]:
+        with one_blas_thread():
+            work(0)
+            begin = time.thread_time()
+            for i in range(blocks):
+                work(i)
+        return float(blocks * size), time.thread_time() - begin
+
+    return (
+        lambda: timed(lambda i: monitor.block(source.block(i)), 1000),
+        lambda: timed(lambda _: loops(size), 200),
+    )
+
+
+def _front_end() -> tuple[float, float]:
+    """Samples through every stage of scenario front-end, the synthesis of its three satellites included."""
+    source = scenario.source(scenario.load("front-end", [f"front_end.fs_hz={FS_HZ}"])[0])
+    source.read(round(0.1 * FS_HZ))
+    begin = time.thread_time()
+    for _ in range(10):
+        source.read(round(0.2 * FS_HZ))
+    return 2.0 * FS_HZ, time.thread_time() - begin
 
 
 def _acquisition() -> float:
