@@ -321,6 +321,7 @@ def _attack(h5: h5py.File, channels: dict[str, h5py.Group], directory: Path) -> 
     if not spans or not channels:
         return None
     path = directory / "attack.png"
+    seen: tuple[list, list] = ([], [])
     with figure(path, "Under attack (shaded)", rows=3, size=(9, 8)) as axes:
         for k, group in enumerate(channels.values()):
             e, color = group["epochs"][:], f"C{k}"
@@ -330,14 +331,16 @@ def _attack(h5: h5py.File, channels: dict[str, h5py.Group], directory: Path) -> 
             truth = satellite_truth(h5, b"G" if attrs["signal"] == "L1CA" else b"E", attrs["prn"])
             if len(truth) > 1:
                 errors = tracking_errors(e, truth, attrs["fs_hz"], attrs["signal"])
-                axes[1].plot(errors["t_s"], errors["code_m"], lw=0.6, color=color)
-                axes[2].plot(errors["t_s"], errors["doppler_hz"], lw=0.6, color=color)
-        for ax, label, limit in zip(
-            axes, ("C/N0 (dB-Hz)", "code (m)", "Doppler (Hz)"), (None, 60, 20), strict=True
-        ):
+                settled = errors["t_s"] > errors["t_s"][:1] + 1.0
+                for ax, values, key in zip(axes[1:], seen, ("code_m", "doppler_hz"), strict=True):
+                    ax.plot(errors["t_s"], errors[key], lw=0.6, color=color)
+                    values.append(np.abs(errors[key][settled]))
+        for ax, values, least, most in zip(axes[1:], seen, (5.0, 1.0), (300.0, 50.0), strict=True):
+            widest = max((np.quantile(v, 0.999) for v in values if len(v)), default=least)
+            limit = 1.2 * float(np.clip(widest, least, most))
+            ax.set_ylim(-limit, limit)
+        for ax, label in zip(axes, ("C/N0 (dB-Hz)", "code (m)", "Doppler (Hz)"), strict=True):
             ax.set_ylabel(label)
-            if limit:
-                ax.set_ylim(-limit, limit)
             for begin, end in spans:
                 ax.axvspan(begin, end, color="C3", alpha=0.12, lw=0)
         axes[0].legend(ncol=8, fontsize=7)
