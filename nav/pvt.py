@@ -15,6 +15,7 @@ from nav.frames import geodetic_from_ecef, rotation_enu_to_ecef
 from nav.records import SATELLITE
 from signals.constants import C_MPS, SECONDS_PER_WEEK, WAVELENGTH_M
 from signals.geometry_kernels import (
+    IONOSPHERE_M,
     KLOBUCHAR_X_ICD,
     klobuchar_kernel,
     orbit_kernel,
@@ -124,13 +125,13 @@ def _look_kernel(pos, vel, lat, lon, height, sat_pos, sat_vel, tow_s, iono_on, a
 def look(sats, pos_ecef_m, vel_ecef_mps, tow_s, klobuchar=None, troposphere=False):
     """Fill azimuth, elevation, the two delays and their rate of ``sats`` in place, seen from pos_ecef_m.
 
-    ``klobuchar`` is (alpha (4,), beta (4,)) or None. Below 1.1 deg and for positions off the Earth (height
-    outside -5..100 km) the delays are zero: the models do not hold there. The velocity matters for the
+    ``klobuchar`` is (alpha (4,), beta (4,)) or None. Below 1.1 deg, below -5 km and above the ionosphere's shell
+    (``IONOSPHERE_M``) the delays are zero: the models do not hold there. The velocity matters for the
     rate alone (a climb of 1 m/s lowers the zenith delay by 0.3 mm/s).
     """
     pos = np.ascontiguousarray(pos_ecef_m, dtype=float)
     lat, lon, height = geodetic_from_ecef(pos)
-    near = -5e3 < height < 100e3
+    near = -5e3 < height < IONOSPHERE_M
     alpha, beta = klobuchar if klobuchar is not None else (np.zeros(4), np.zeros(4))
     alpha, beta = (np.ascontiguousarray(c, dtype=float) for c in (alpha, beta))
     vel = np.ascontiguousarray(vel_ecef_mps, dtype=float)

@@ -34,6 +34,8 @@ ORBIT_FIELDS = (
 )
 """Columns of the flat orbit array made by `signals.orbits.orbit_coefficients`."""
 
+IONOSPHERE_M = 350e3
+"""Height of the shell that holds all of Klobuchar's ionosphere (IS-GPS-200, 20.3.3.5.2.5): above it there is none."""
 KLOBUCHAR_X_ICD = 1.57
 """Half width of the day-time cosine, rad (IS-GPS-200, figure 20-4)."""
 KLOBUCHAR_X_CONTINUOUS = math.sqrt(6.0 - math.sqrt(12.0))
@@ -178,7 +180,7 @@ def _atmosphere(lat, lon, height, dx, dy, dz, tow_s, iono_on, alpha, beta, tropo
     # A satellite below the mask is not synthesised; the floor only keeps its numbers finite.
     el = max(el, _MIN_ELEVATION_RAD)
     iono_s, tropo_s = 0.0, 0.0
-    if iono_on:
+    if iono_on and height < IONOSPHERE_M:
         iono_s = klobuchar_kernel(lat, lon, az, el, tow_s, alpha, beta, KLOBUCHAR_X_CONTINUOUS)
     if tropo_on:
         tropo_s = saastamoinen_kernel(lat, height, el, humidity) / C_MPS

@@ -1,4 +1,4 @@
-"""RINEX navigation files: read (2 and 3, GPS and Galileo I/NAV, by georinex) and written (3.04).
+"""RINEX navigation files: read (2, 3 and 4, GPS and Galileo I/NAV, by georinex) and written (3.04).
 
 georinex 1.16 takes the fields apart. Around it: it pads a (time, satellite) grid with NaN and files repeated
 epochs under invented names ('E24_1'), it refuses rows whose blank fields are cut off, and it keeps no time
@@ -74,7 +74,7 @@ _FIELDS = {
 
 
 def read_rinex_nav(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
-    """Ephemerides and ionosphere/UTC parameters of a RINEX 2 or 3 navigation file, plain or gzip.
+    """Ephemerides and ionosphere/UTC parameters of a RINEX 2, 3 or 4 navigation file, plain or gzip.
 
     Parameters
     ----------
@@ -87,18 +87,20 @@ def read_rinex_nav(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
         are for E5a), sorted by system, PRN, toe, transmission time; identical copies once. Values as written:
         call `signals.orbits.check_ephemeris` on what is used.
     IONO_UTC ()
-        From the header, moved to tot = t0g = 0 and message resolution; what the header lacks is the default.
+        From the header (RINEX 4: from the last ION and STO records), moved to tot = t0g = 0 and message resolution;
+        what is lacking is the default.
 
     Raises
     ------
     ValueError
-        Missing, too large, not RINEX 2/3 navigation, malformed, or without a GPS or Galileo record.
+        Missing, too large, not RINEX navigation, malformed, or without a GPS or Galileo record.
     ModuleNotFoundError
         georinex is not installed; the message names the extra.
 
     Notes
     -----
-    RINEX 3.04, tables A5, A6, A8; RINEX 2.11, tables A3, A4.
+    RINEX 3.04, tables A5, A6, A8; RINEX 2.11, tables A3, A4; RINEX 4.00, 5.4 (records of other systems and of CNAV
+    and F/NAV are skipped). Comments and headers in the middle, as in files put together, are skipped too.
     """
     version, kind, header, records = _split(path, _read_text(path))
     ephemerides = _flatten(_georinex(path, version, kind, records))
@@ -165,20 +167,24 @@ def _read_text(path) -> list[str]:
 def _split(path, lines: list[str]) -> tuple[int, str, list[str], list[list[str]]]:
     """Version, type letter, header lines, and records of GPS and Galileo as their eight lines."""
     first = lines[0].ljust(80) if lines else ""
-    if "RINEX VERSION" not in first or not re.fullmatch(r"\s*[23](\.\d+)?\s*", first[:9]):
+    if "RINEX VERSION" not in first or not re.fullmatch(r"\s*[234](\.\d+)?\s*", first[:9]):
         raise ValueError(
-            f"file {path} is not RINEX 2 or 3: its first line must state the version in columns 1-9"
+            f"file {path} is not RINEX 2, 3 or 4: its first line must state the version in columns 1-9"
         )
     version = int(float(first[:9]))
     kind = first[20]
-    if kind not in ("N" if version == 3 else "NE"):
+    if kind not in ("NE" if version == 2 else "N"):
         raise ValueError(f"RINEX file {path} is of type {kind!r}: GPS or Galileo navigation data are needed")
     end = next((i for i, line in enumerate(lines) if "END OF HEADER" in line), None)
     if end is None:
         raise ValueError(f"RINEX file {path} has no END OF HEADER: it is damaged or cut off")
-    epoch = re.compile(r"[GE][ \d]\d \d{4}" if version == 3 else r"[ \d]\d [ \d]\d ")
-    other = re.compile(r"[A-Z][ \d]\d \d{4}" if version == 3 else r"[ \d]\d [ \d]\d ")
-    body = lines[end + 1 :]
+    epoch = re.compile(r"[GE][ \d]\d \d{4}" if version > 2 else r"[ \d]\d [ \d]\d ")
+    other = re.compile(r"[A-Z][ \d]\d \d{4}" if version > 2 else r"[ \d]\d [ \d]\d ")
+    # A letter in column 61 begins the label of a header's line.
+    header, body = lines[:end], [line for line in lines[end + 1 :] if not line[60:61].isalpha()]
+    if version == 4:
+        version, corrections, body = 3, *_as_rinex_3(path, body)
+        header = header + corrections
     starts = [i for i, line in enumerate(body) if other.match(line)]
     records = [body[a:b] for a, b in zip(starts, [*starts[1:], len(body)]) if epoch.match(body[a])]
     records = [[line for line in record if line.strip()] for record in records]
@@ -191,7 +197,50 @@ def _split(path, lines: list[str]) -> tuple[int, str, list[str], list[list[str]]
             raise ValueError(
                 f"RINEX file {path}: the record {record[0][:23]!r} has {len(record)} lines instead of 8"
             )
-    return version, kind, lines[:end], records
+    return version, kind, header, records
+
+
+def _as_rinex_3(path, body: list[str]) -> tuple[list[str], list[str]]:
+    """Lines of a RINEX 4 body as RINEX 3 has them: corrections for the header, and records of LNAV and I/NAV."""
+    corrections, records = [], []
+    starts = [i for i, line in enumerate(body) if line.startswith(">")]
+    for a, b in zip(starts, [*starts[1:], len(body)]):
+        words = body[a].split()
+        kind, message = words[1:2], words[3:4]
+        if kind == ["EPH"] and message in (["LNAV"], ["INAV"]) and words[2][0] in "GE":
+            records += body[a + 1 : b]
+        elif kind in (["ION"], ["STO"]):
+            try:
+                corrections += _correction_lines(kind[0], words[2][0] + "".join(message), body[a + 1 : b])
+            except (ValueError, IndexError, OverflowError):
+                raise ValueError(f"RINEX file {path}: the record {body[a].strip()!r} is malformed") from None
+    return corrections, records
+
+
+def _correction_lines(kind: str, source: str, lines: list[str]) -> list[str]:
+    """Header lines of RINEX 3 that say what an ION or STO record of RINEX 4 says; none for those of no use here."""
+    numbers = [_fields(lines[0], 23), *(_fields(line, 4) for line in lines[1:])]
+    if kind == "ION" and source == "GLNAV":
+        values = [x for row in numbers for x in row][:8]
+        rows = [("GPSA", values[:4]), ("GPSB", values[4:])]
+    elif kind == "ION" and source == "EIFNV":
+        rows = [("GAL ", [*numbers[0], 0.0][:4])]
+    elif kind == "STO" and lines[0][24:28] in ("GPUT", "GAGP", "GPGA"):
+        week, tow_s = week_tow(datetime(*(int(x) for x in lines[0][4:23].split())))  # type: ignore[arg-type]
+        a0, a1 = numbers[1][1:3]
+        text = f"{lines[0][24:28]} {a0:17.10E}{a1:16.9E}{int(tow_s):7d}{week:5d}"
+        return [text.ljust(60) + "TIME SYSTEM CORR"]
+    else:
+        return []
+    return [
+        (f"{key} " + "".join(f"{x:12.4E}" for x in row)).ljust(60) + "IONOSPHERIC CORR" for key, row in rows
+    ]
+
+
+def _fields(line: str, start: int) -> list[float]:
+    """Numbers of 19 columns each from ``start`` on."""
+    cells = [line[i : i + 19].strip() for i in range(start, len(line.rstrip()), 19)]
+    return [float(re.sub("[Dd]", "E", cell)) for cell in cells if re.fullmatch(r"[-+.\dEeDd]+", cell)]
 
 
 def _georinex(path, version: int, kind: str, records: list[list[str]]):
@@ -243,7 +292,7 @@ def _complete(path, record: list[str], indent: int) -> list[str]:
     for row, line in enumerate(record):
         start = indent if row else indent + 19
         cells = [line[start + 19 * i : start + 19 * (i + 1)] for i in range(4 if row else 3)]
-        cells = [re.sub("[Dd]", "E", cell).rjust(19) if cell.strip() else _ZERO for cell in cells]
+        cells = [re.sub("[Dde]", "E", cell).rjust(19) if cell.strip() else _ZERO for cell in cells]
         for cell in cells:
             if not re.fullmatch(r"\s*[-+]?\d*\.?\d+\.?(E[-+]?\d{1,3})?\s*", cell):
                 raise ValueError(

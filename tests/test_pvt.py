@@ -438,5 +438,17 @@ def test_spec_refuses_what_it_would_ignore():
     )
 
 
+@pytest.mark.parametrize("height_m", [-400.0, 99_999.0, 100_000.0])
+@pytest.mark.parametrize("lat_deg, lon_deg", [(0.0, 180.0), (48.1, 11.6)])
+def test_sky_and_receiver_have_the_same_atmosphere_up_to_100_km(height_m, lat_deg, lon_deg):
+    """Noise-free ranges at any height, on the equator and the date line too, as in the first test."""
+    sky = make_sky(motion=Line(lat_deg=lat_deg, lon_deg=lon_deg, height_m=height_m))
+    nav, (row,) = _fix(sky, NavigationSpec(smoothing_s=0), [30.0])
+    assert row is not None, nav.reason
+    assert np.linalg.norm(_error(sky, row)[0]) < 0.01
+    # Klobuchar's least is 5 ns.
+    assert nav.satellites["iono_m"].min() > 4e-9 * C_MPS
+
+
 def test_sky_default_is_what_the_receiver_models():
     assert SkySpec().ionosphere == NavigationSpec().iono and SkySpec().troposphere == NavigationSpec().tropo

@@ -131,6 +131,91 @@ def test_rinex_2_is_read_and_a_repeated_epoch_costs_no_satellite(tmp_path):
     assert np.allclose(iono["beta"], [83_968, 98_304, -65_536, -524_288])
 
 
+def rinex_4(records):
+    """The records as RINEX 4.00 has them (tables A7 to A36), among records of other kinds and systems."""
+    from signals.rinex import _galileo_lines, _gps_lines
+
+    lines = [
+        "     4.00           NAVIGATION DATA     M                   RINEX VERSION / TYPE",
+        f"{'    18    18  1929     7':60}LEAP SECONDS",
+        f"{'':60}END OF HEADER",
+        "> STO G03 LNAV",
+        "    2024 03 01 00 00 00 GPUT                                  UTC(USNO)",
+        "     4.320000000000E+05 9.313225746155E-10-5.329070518201E-15 0.000000000000E+00",
+        "> EPH R04 FDMA",
+        "R04 2024 03 01 00 15 00 1.0E-05 0.0E+00 0.0E+00",
+        *["     1.0E+00 1.0E+00 1.0E+00 1.0E+00"] * 4,
+        "> EOP G03 CNAV",
+        "    2024 03 01 00 00 00 1.0E-01 1.0E-04 0.0E+00",
+        *["                        1.0E-01 1.0E-04 0.0E+00"] * 2,
+        "> EPH G05 CNAV",
+        "G05 2024 03 01 12 00 00 1.0E-04 0.0E+00 0.0E+00",
+        *["     1.0E+00 1.0E+00 1.0E+00 1.0E+00"] * 8,
+    ]
+    for eph in records:
+        system = bytes(eph["system"]).decode()
+        lines.append(f"> EPH {system}{int(eph['prn']):02d} {'LNAV' if system == 'G' else 'INAV'}")
+        lines += _gps_lines(eph) if system == "G" else _galileo_lines(eph)
+    return [
+        *lines,
+        "> ION G03 LNAV",
+        "    2024 03 01 12 00 00 1.117587089539E-08 1.490116119385E-08-5.960464477539E-08",
+        "    -1.192092895508E-07 8.396800000000E+04 9.830400000000E+04-6.553600000000E+04",
+        "    -5.242880000000E+05 0.000000000000E+00",
+        "> ION E11 IFNV",
+        "    2024 03 01 12 00 00 1.235000000000E+02 4.101562500000E-01 9.765625000000E-04",
+        "     0.000000000000E+00",
+        "> ION C20 CNVX",
+        "    2024 03 01 12 00 00 1.0E+01 1.0E+00 1.0E+00",
+    ]
+
+
+def test_rinex_4_gives_what_rinex_3_gives(tmp_path):
+    path = tmp_path / "brd4.rnx"
+    path.write_text("\n".join(rinex_4(BOTH)) + "\n")
+    ephemerides, iono = read_rinex_nav(path)
+    close(ephemerides, read_rinex_nav(written(tmp_path))[0])
+    assert np.allclose(iono["alpha"], [12 * 2.0**-30, 2 * 2.0**-27, -(2.0**-24), -2 * 2.0**-24], rtol=0)
+    assert np.allclose(iono["beta"], [83_968, 98_304, -65_536, -524_288])
+    assert np.allclose(iono["ai"], [123.5, 105 * 2.0**-8, 32 * 2.0**-15]) and iono["dt_ls_s"] == 18
+    # A0 at the start of the week: -6 / 2^50 s/s over the 432000 s since.
+    assert iono["a0_utc_s"] == pytest.approx(2.0**-30 + 6 * 2.0**-50 * 432_000, abs=2.0**-31)
+    text = path.read_text().replace("GPUT  ", "GPUT x").replace("> STO G03", "> STO")
+    path.write_text(text.replace("2024 03 01 12 00 00 1.235", "2024 03 xx 12 00 00 1.235"))
+    read_rinex_nav(path)  # what is of no use need not be right
+    path.write_text("\n".join(rinex_4(BOTH)).replace("2024 03 01 00 00 00 GPUT", "2024 13 01 00 00 00 GPUT"))
+    with pytest.raises(ValueError, match=r"STO G03 LNAV.*malformed"):
+        read_rinex_nav(path)
+
+
+def test_files_put_together_with_comments_and_other_systems(tmp_path):
+    lines = written(tmp_path).read_text().splitlines()
+    end = next(i for i, line in enumerate(lines) if "END OF HEADER" in line)
+    header, body = lines[: end + 1], lines[end + 1 :]
+    glonass = [
+        "R04 2024 03 01 00 15 00" + " 1.000000000000D-05" * 3,
+        *["    " + " 1.000000000000D+00" * 4] * 3,
+    ]
+    beidou = [
+        "C20 2024 03 01 00 00 00" + " 1.000000000000D-05" * 3,
+        *["    " + " 1.000000000000D+00" * 4] * 7,
+    ]
+    comment = f"{'put together by hand':60}COMMENT"
+    text = [
+        *header,
+        *glonass,
+        *body[:8],
+        comment,
+        *header,
+        *beidou,
+        *(line.replace("E", "e") for line in body[8:80]),
+    ]
+    text = [line if line[:1] != "e" else "E" + line[1:] for line in text]
+    path = tmp_path / "together.rnx"
+    path.write_text("\r\n".join(text) + "\r\n")
+    close(read_rinex_nav(path)[0], read_rinex_nav(written(tmp_path))[0])
+
+
 def test_select_prefers_the_latest_past_record():
     rows = np.repeat(BOTH[5:6], 4)
     rows["toe_s"] = TOW + np.array([-7_200.0, -1_200.0, 600.0, -1_200.0])
@@ -161,8 +246,8 @@ def test_strangers_files_are_refused_with_one_sentence(tmp_path, monkeypatch):
     good = written(tmp_path).read_text()
     cases = {
         "does not exist": None,
-        "is not RINEX 2 or 3": "",
-        "is not RINEX 2 or 3: ": good.replace("     3.04", "     4.00"),
+        "is not RINEX 2, 3 or 4": "",
+        "is not RINEX 2, 3 or 4: ": good.replace("     3.04", "     5.00"),
         "is of type 'O'": good.replace("NAVIGATION DATA", "OBSERVATION DAT"),
         "END OF HEADER": good.split("END OF HEADER")[0],
         "lines instead of 8": "\n".join(good.splitlines()[:-1]),

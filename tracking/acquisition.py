@@ -56,6 +56,7 @@ _WEAK_DB = (
 _FOLLOW_MS = 40  # samples used for verification, and for refinement
 _CANDIDATES = 8
 _REFERENCES = 32
+_WIDEST_HZ = 170e3  # a clock 1e-4 off makes 157.5 kHz, satellite and receiver up to 12 kHz more
 
 
 class AcquisitionSpec(BaseModel):
@@ -69,9 +70,9 @@ class AcquisitionSpec(BaseModel):
     """GPS satellites that are searched."""
     galileo_prns: tuple[int, ...] = tuple(range(1, 37))
     """Galileo satellites that are searched."""
-    doppler_range_hz: float = Field(default=5000.0, gt=0, le=100e3)
+    doppler_range_hz: float = Field(default=5000.0, gt=0, le=_WIDEST_HZ)
     """Half width of the search."""
-    doppler_center_hz: float = Field(default=0.0, ge=-100e3, le=100e3)
+    doppler_center_hz: float = Field(default=0.0, ge=-_WIDEST_HZ, le=_WIDEST_HZ)
     """Middle of the search: the Doppler of a known receiver clock drift."""
     doppler_step_hz: float | None = Field(default=None, ge=5.0, le=1000.0)
     """At most this; default half the inverse of the coherent integration."""
