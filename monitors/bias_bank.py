@@ -15,6 +15,7 @@ clean time; delay ~ max[(ln(1/floor) + ln 99) / D_null, ln 99 / D_neighbour], D 
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -23,6 +24,16 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 SINGULAR = 1e-9
 """Relative size below which a column of H counts as dependent on the others."""
+NOT_FINITE, NOT_POSITIVE = -2, -1
+FINITE = "H must be a finite matrix of one row per satellite."
+
+
+@lru_cache(maxsize=4096)
+def chi2_limit(dof: int, p: float) -> float:
+    """Chi-square quantile exceeded with probability p, kept."""
+    from scipy.special import chdtri
+
+    return float(chdtri(dof, p))
 
 
 def projector(h: np.ndarray) -> np.ndarray:
@@ -40,14 +51,25 @@ def parity_rows(h: np.ndarray) -> np.ndarray:
 
 @njit(cache=True, nogil=True)
 def whitened_parity(h, var, w):
-    """W = R^-1 - R^-1 H (H' R^-1 H)^-1 H' R^-1 into ``w`` (m, m), R = diag(var); returns the rank of H.
+    """W = R^-1 - R^-1 H (H' R^-1 H)^-1 H' R^-1 into ``w`` (m, m), R = diag(var); returns the rank of H and its non-zero columns.
 
     Orthonormal basis Q of R^-1/2 H by Gram-Schmidt, each column twice (Bjorck 1967); W = R^-1/2 (I - Q Q') R^-1/2.
+    The rank is NOT_FINITE or NOT_POSITIVE, and nothing computed, where H or the variances are no good.
     """
     m, n = h.shape
     q = np.zeros((n, m))
     root = np.empty(m)
+    columns = 0
+    for j in range(n):
+        filled = False
+        for a in range(m):
+            if not math.isfinite(h[a, j]):
+                return NOT_FINITE, 0
+            filled |= h[a, j] != 0.0
+        columns += filled
     for a in range(m):
+        if not var[a] > 0.0:
+            return NOT_POSITIVE, columns
         root[a] = 1.0 / math.sqrt(var[a])
     rank = 0
     for j in range(n):
@@ -79,7 +101,13 @@ def whitened_parity(h, var, w):
             for i in range(rank):
                 acc -= q[i, a] * q[i, b]
             w[a, b] = acc * root[a] * root[b]
-    return rank
+    return rank, columns
+
+
+@njit(cache=True, nogil=True)
+def enough(rank, m, columns):
+    """Whether m rows of that rank in so many non-zero columns are one more than a fault of one row needs to be seen."""
+    return m >= rank + 2 and rank >= min(columns, 4)
 
 
 def geometry(h: np.ndarray) -> np.ndarray:
@@ -99,7 +127,7 @@ def geometry(h: np.ndarray) -> np.ndarray:
 def _finite(h: np.ndarray) -> np.ndarray:
     h = np.ascontiguousarray(h, dtype=np.float64)
     if h.ndim != 2 or not np.isfinite(h).all():
-        raise ValueError("H must be a finite matrix of one row per satellite.")
+        raise ValueError(FINITE)
     return h
 
 
@@ -114,12 +142,16 @@ def _check(rank: int, m: int, columns: int) -> None:
 
 def parity_weight(h: np.ndarray, var: np.ndarray) -> tuple[np.ndarray, int]:
     """(W (m, m) of the module's docstring, its degrees of freedom) for R = diag(``var``), m^2."""
-    h, var = _finite(h), np.ascontiguousarray(var, dtype=np.float64)
-    if not (var > 0).all():
-        raise ValueError("The bias bank needs measurement variances above zero.")
+    h, var = np.ascontiguousarray(h, dtype=np.float64), np.ascontiguousarray(var, dtype=np.float64)
+    if h.ndim != 2:
+        raise ValueError(FINITE)
     w = np.empty((var.size, var.size))
-    rank = whitened_parity(h, var, w)
-    _check(rank, var.size, int(h.any(axis=0).sum()))
+    rank, columns = whitened_parity(h, var, w)
+    if rank == NOT_FINITE:
+        raise ValueError(FINITE)
+    if rank == NOT_POSITIVE:
+        raise ValueError("The bias bank needs measurement variances above zero.")
+    _check(rank, var.size, columns)
     return w, var.size - rank
 
 
@@ -155,14 +187,23 @@ def update_log(log_p, w, r, row, bias_m, log_floor):
     """
     m = r.size
     wr = np.zeros(m)
+    own = np.zeros(m)
     null = 0.0
     for a in range(m):
         for b in range(m):
             wr[a] += w[a, b] * r[b]
         null += r[a] * wr[a]
+        own[a] = w[a, a]
+    weigh(log_p, wr, own, row, bias_m, log_floor)
+    return null
+
+
+@njit(cache=True, nogil=True)
+def weigh(log_p, wr, own, row, bias_m, log_floor):
+    """The recursion itself: ``wr`` (m,) W r, ``own`` (m,) diagonal of W."""
     for i in range(log_p.size):
         s, mu = row[i], bias_m[i]
-        log_p[i] += mu * wr[s] - 0.5 * mu * mu * w[s, s]
+        log_p[i] += mu * wr[s] - 0.5 * mu * mu * own[s]
     total = log_sum_exp(log_p)
     clipped = False
     for i in range(log_p.size):
@@ -174,7 +215,30 @@ def update_log(log_p, w, r, row, bias_m, log_floor):
         total = log_sum_exp(log_p)
         for i in range(log_p.size):
             log_p[i] -= total
-    return null
+
+
+@njit(cache=True, nogil=True)
+def bank_epoch(log_p, chi2, w, r, used, row, bias_m, log_floor):
+    """One epoch of a bank: ``w`` (k, k) of the k satellites of ``used`` (m,); ``chi2`` (M,) <- that of each hypothesis."""
+    m = used.size
+    wr, own = np.zeros(m), np.zeros(m)
+    null = 0.0
+    i = 0
+    for a in range(m):
+        if not used[a]:
+            continue
+        j = 0
+        for b in range(m):
+            if used[b]:
+                wr[a] += w[i, j] * r[b]
+                j += 1
+        null += r[a] * wr[a]
+        own[a] = w[i, i]
+        i += 1
+    weigh(log_p, wr, own, row, bias_m, log_floor)
+    for h in range(row.size):
+        s, mu = row[h], bias_m[h]
+        chi2[h] = null - 2 * mu * wr[s] + mu * mu * own[s]
 
 
 @njit(cache=True, nogil=True)
@@ -304,7 +368,7 @@ class BiasBankRun:
         self._chi2 = np.zeros((spec.fit_epochs, self.row.size))
         self._dof = np.zeros(spec.fit_epochs, dtype=np.int64)
         self._count = 0
-        self._limit: dict[int, float] = {}
+        self._log_floor = math.log(spec.floor)
 
     def __call__(self, r: np.ndarray, h: np.ndarray, r_cov: np.ndarray, used: np.ndarray | None = None):
         """Update with innovations ``r`` (m,), rows ``h`` (m, n), R ``r_cov`` (m,) or (m, m); returns a BiasReport.
@@ -325,12 +389,9 @@ class BiasBankRun:
             self.unavailable = str(error)
             return None
         self.unavailable = None
-        w = np.zeros((m, m))
-        w[np.ix_(u, u)] = part
-        y = np.where(used, r, 0.0)
-        null = update_log(self.log_p, w, y, self.row, self.bias_m, math.log(self.spec.floor))
         slot = self._count % self.spec.fit_epochs
-        self._chi2[slot] = null - 2 * self.bias_m * (w @ y)[self.row] + self.bias_m**2 * np.diag(w)[self.row]
+        r = np.ascontiguousarray(r, np.float64)
+        bank_epoch(self.log_p, self._chi2[slot], part, r, used, self.row, self.bias_m, self._log_floor)
         self._dof[slot] = dof
         self._count += 1
         return self._report()
@@ -350,18 +411,10 @@ class BiasBankRun:
         held = min(self._count, self.spec.fit_epochs)
         best = int(np.argmax(self.log_p))
         chi2, dof = float(self._chi2[:held, best].sum()), int(self._dof[:held].sum())
-        fits = chi2 <= self._threshold(dof)
+        fits = chi2 <= chi2_limit(dof, self.spec.fit_p_false)
         likely = self.log_p[best] > math.log(self.spec.declare)
         declared = bool(likely and fits and self.bias_m[best] != 0.0)
         return BiasReport(np.exp(self.log_p), self.row, self.bias_m, best, fits, declared, chi2, dof)
-
-    def _threshold(self, dof: int) -> float:
-        """Chi-square quantile at 1 - fit_p_false, kept per degree of freedom."""
-        if dof not in self._limit:
-            from scipy.special import chdtri
-
-            self._limit[dof] = float(chdtri(dof, self.spec.fit_p_false))
-        return self._limit[dof]
 
     def correction_m(self, report: BiasReport) -> np.ndarray:
         """Bias (m,) to subtract from the measured ranges: the declared one, else zeros."""

@@ -134,11 +134,11 @@ def follow(epochs, counts, slot, ring, done, last):
     """Differences of successive code discriminators of all channels of a slab, in chips, into ``ring`` (S, N).
 
     ``epochs``: columns ``COLUMNS`` of EPOCH, each (C, n); ``counts`` (C,) of them valid; ``slot`` (C,) row of each channel, -1:
-    none. ``done`` (S,) differences so far; ``last`` (S, 5): sample after the last integration in lock (-1: none), its
-    discriminator, and of the newest integration its samples, C/N0 (dB-Hz) and whether it was in lock
+    none. ``done`` (S,) differences so far; ``last`` (S, 6): sample after the last integration in lock (-1: none), its
+    discriminator, and of the newest integration its samples, C/N0 (dB-Hz), loop bandwidth (Hz) and whether it was in lock
     (-1: nothing new).
     """
-    first, samples, state, error, cn0 = epochs
+    first, samples, state, error, cn0, bandwidth = epochs
     for c in range(counts.size):
         s = slot[c]
         if s < 0 or counts[c] == 0:
@@ -152,8 +152,8 @@ def follow(epochs, counts, slot, ring, done, last):
                 done[s] += 1
             last[s, 0], last[s, 1] = first[c, k] + samples[c, k], error[c, k]
         k = counts[c] - 1
-        last[s, 2], last[s, 3] = samples[c, k], cn0[c, k]
-        last[s, 4] = 1.0 if state[c, k] == STATE_LOCKED else 0.0
+        last[s, 2], last[s, 3], last[s, 4] = samples[c, k], cn0[c, k], bandwidth[c, k]
+        last[s, 5] = 1.0 if state[c, k] == STATE_LOCKED else 0.0
 
 
 @njit(cache=True, nogil=True)
@@ -163,7 +163,7 @@ def window_variances(ring, done, scheme, decay, out):
         out[s] = window_variance(ring[s], done[s], scheme, decay)
 
 
-COLUMNS = ("sample_index", "n_samples", "state", "code_error_chips", "cn0_dbhz")
+COLUMNS = ("sample_index", "n_samples", "state", "code_error_chips", "cn0_dbhz", "dll_bw_hz")
 
 
 class DiscriminatorNoise:
@@ -179,7 +179,7 @@ class DiscriminatorNoise:
         self._names: list[str] = []
         self._loops: list[tuple[float, float]] = []
         self._ring = np.zeros((0, spec.window))
-        self._done, self._last = np.zeros(0, np.int64), np.zeros((0, 5))
+        self._done, self._last = np.zeros(0, np.int64), np.zeros((0, 6))
 
     def hear(self, channels: dict[tuple[str, int], int], epochs: np.ndarray, counts: np.ndarray, loops: Any):
         """``epochs`` (C, n): EPOCH rows of a slab, ``counts`` (C,) of them valid; ``channels``: channel of (signal, PRN);
@@ -208,13 +208,13 @@ class DiscriminatorNoise:
         mean = np.empty(len(self._names))
         window_variances(self._ring, self._done, SCHEMES[self.spec.scheme], self.spec.decay, mean)
         out = {}
-        for s in np.flatnonzero((self._last[:, 4] > 0) & (self._done >= self.spec.window)).tolist():
+        for s in np.flatnonzero((self._last[:, 5] > 0) & (self._done >= self.spec.window)).tolist():
             name, (spacing, bw_hz) = self._names[s], self._loops[s]
-            _, _, samples, cn0_dbhz, _ = self._last[s].tolist()
+            _, _, samples, cn0_dbhz, now_hz, _ = self._last[s].tolist()
             t_s = samples / self.fs_hz
-            share = _share(name[0], spacing, round(cn0_dbhz), t_s, 0.0 if steered else bw_hz)
+            share = _share(name[0], spacing, round(cn0_dbhz), t_s, 0.0 if steered else now_hz or bw_hz)
             out[name] = float(mean[s]) * METRES_PER_CHIP**2 * share + self.spec.r0_m2
-        self._last[:, 4] = -1.0
+        self._last[:, 5] = -1.0
         return out
 
 

@@ -59,6 +59,7 @@ class NormalPoints:
         self._gain = np.repeat(np.array([clock, drift]), slots)
         self.epochs, self.single = 0, np.full(m, np.nan)
         self._ring = empty_log(length, n, m)
+        self._views = [EpochLog(*(array[i, ...] for array in self._ring)) for i in range(length)]
         self._start: np.ndarray | None = None
         self._open()
 
@@ -114,8 +115,7 @@ class NormalPoints:
 
     def last(self) -> EpochLog:
         """The last normal point (views, ``s`` empty)."""
-        i = (self.count - 1) % self.length
-        return EpochLog(*(array[i] for array in self._ring))
+        return self._views[(self.count - 1) % self.length]
 
     def log(self, n_epochs: int | None = None) -> EpochLog:
         """The last ``n_epochs`` normal points, oldest first (copies, ``s`` left empty)."""

@@ -463,6 +463,22 @@ class ParallelBank:
         )
 
 
+@njit(cache=True, nogil=True)
+def gather(total_phi, total_qd, moved, row, total, total_var, count, phi, qd, h, r, var, avail):
+    """One epoch of the filter into a PacedBank's sums, in place; rows of ``avail`` (m,) count."""
+    chain(total_phi, total_qd, phi, qd)
+    moved[:] = np.dot(phi, moved)
+    for i in range(avail.size):
+        if not avail[i]:
+            continue
+        total[i] += r[i]
+        for j in range(moved.size):
+            total[i] += h[i, j] * moved[j]
+            row[i, j] = h[i, j]
+        total_var[i] += var[i]
+        count[i] += 1.0
+
+
 class PacedBank:
     """A ParallelBank on every n-th epoch of a filter that corrects its own trajectory in between, on the mean of the ranges.
 
@@ -484,12 +500,8 @@ class PacedBank:
 
     def __call__(self, phi, qd, h, r, var, avail, dx, aids=None) -> BankReport | None:
         """One epoch of the filter: ``r`` (m,) innovations that its correction ``dx`` (n,) followed; ``aids`` (h, r, var)."""
-        chain(self._phi, self._qd, phi, qd)
-        self._moved = phi @ self._moved
-        self._h[avail] = h[avail]
-        self._sum += np.where(avail, r + h @ self._moved, 0.0)
-        self._var += np.where(avail, var, 0.0)
-        self._n += avail
+        sums = self._phi, self._qd, self._moved, self._h, self._sum, self._var, self._n
+        gather(*sums, phi, qd, h, r, var, avail)
         self._epoch += 1
         if self._epoch % self.every:
             self._moved += dx

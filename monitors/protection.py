@@ -16,9 +16,10 @@ from functools import lru_cache
 from typing import Literal
 
 import numpy as np
+from numba import njit
 from pydantic import BaseModel, ConfigDict, Field
 
-from monitors.bias_bank import SINGULAR
+from monitors.bias_bank import SINGULAR, chi2_limit
 from nav.eskf import EpochLog
 
 STANFORD = ("available", "misleading", "unavailable", "unavailable misleading", "hazardous")
@@ -155,14 +156,6 @@ def protection_levels(h_enu: np.ndarray, var: np.ndarray, spec: Protection) -> L
     return Levels(hpl, vpl, threshold, dof, sigma, worst, vertical[worst][1])
 
 
-@lru_cache(maxsize=256)
-def chi2_limit(dof: int, p: float) -> float:
-    """Chi-square quantile exceeded with probability p, kept."""
-    from scipy.special import chdtri
-
-    return float(chdtri(dof, p))
-
-
 SLOPE_STEP = 1.03
 """Slopes are rounded up to this ratio, so that a level is computed once and not every epoch."""
 
@@ -176,21 +169,39 @@ def _missed(threshold: float, dof: int) -> tuple[np.ndarray, np.ndarray]:
     return bias, chndtr(threshold, dof, np.maximum(bias**2, 1e-12))
 
 
+def _unit_tail(vertical: bool, level, shift):
+    """``_vertical_tail`` and ``_horizontal_tail`` of unit sigma."""
+    from scipy.special import chndtr, ndtr
+
+    if vertical:
+        return ndtr(shift - level) + ndtr(-shift - level)
+    return 1.0 - chndtr(level**2, 2, np.maximum(shift**2, 1e-12))
+
+
 @lru_cache(maxsize=4096)
 def _unit_level(vertical: bool, k: int, allowed: float, threshold: float, dof: int) -> float:
-    """Level of unit sigma for the slope SLOPE_STEP^k per unit of sqrt(non-centrality); as ``_level``, to 1e-4."""
-    from scipy.special import chndtr, ndtr, ndtri
+    """Level of unit sigma for the slope SLOPE_STEP^k per unit of sqrt(non-centrality); as ``_level``, to 1e-4.
+
+    The bias that seems to ask most, by one side of one dimension, is bisected alone; those that its level does not satisfy
+    are left, if any, and so on.
+    """
+    from scipy.special import ndtri
 
     bias, missed = _missed(threshold, dof)
-    shift = SLOPE_STEP**k * bias
-    low, high = 0.0, float(shift[-1]) + 4.0 - float(ndtri(min(allowed, 0.5) / 4))
-    while high - low > 1e-4 * high:
-        middle = 0.5 * (low + high)
-        if vertical:
-            tail = ndtr(shift - middle) + ndtr(-shift - middle)
-        else:
-            tail = 1.0 - chndtr(middle**2, 2, np.maximum(shift**2, 1e-12))
-        low, high = (low, middle) if np.max(tail * missed) <= allowed else (middle, high)
+    live = missed > allowed
+    shift, may = SLOPE_STEP**k * bias[live], allowed / missed[live]
+    low = high = 0.0
+    worst = int(np.argmax(shift - ndtri(may))) if shift.size else 0
+    while shift.size:
+        high = float(shift[worst] + 4.0 - ndtri(may[worst] / 4))
+        while high - low > 1e-4 * high:
+            middle = 0.5 * (low + high)
+            over = _unit_tail(vertical, middle, shift[worst]) > may[worst]
+            low, high = (middle, high) if over else (low, middle)
+        ratio = _unit_tail(vertical, high, shift) / may
+        low, left = high, ratio > 1.0
+        shift, may, ratio = shift[left], may[left], ratio[left]
+        worst = int(np.argmax(ratio)) if ratio.size else 0
     return high
 
 
@@ -218,6 +229,22 @@ def quick_levels(h_enu: np.ndarray, var: np.ndarray, spec: Protection) -> tuple[
             found = max(found, sigma * _unit_level(vertical, k, allowed, threshold, dof))
         levels_m.append(found)
     return levels_m[0], levels_m[1]
+
+
+@njit(cache=True, nogil=True)
+def innovation_ratios(h, p, z, var, seen, out):
+    """z_i^2 / (h_i P h_i' + R_i) of the rows i < ``var.size`` that were ``seen``, in a row into ``out``."""
+    k = 0
+    for i in range(var.size):
+        if not seen[i]:
+            continue
+        s = var[i]
+        for a in range(p.shape[0]):
+            if h[i, a] != 0.0:
+                for b in range(p.shape[0]):
+                    s += h[i, a] * p[a, b] * h[i, b]
+        out[k] = z[i] * z[i] / s
+        k += 1
 
 
 def innovation_chi2(log: EpochLog, p_false_alarm: float) -> tuple[np.ndarray, float]:

@@ -58,6 +58,7 @@ class NavigatorLog:
     def _clear(self) -> None:
         n, m = kernels.N_EKF, 2 * self.slots
         self._ring, self.count = empty_log(self.length, n, m), 0
+        self._views = [EpochLog(*(array[i, ...] for array in self._ring)) for i in range(self.length)]
         self.z, self.h, self.own = np.zeros(m), np.zeros((m, n)), np.ones(m)
         self.seen, self.dx = np.zeros(m, np.bool_), np.zeros(n)
         self._phi, self._qd = np.eye(n), np.zeros((n, n))
@@ -126,8 +127,7 @@ class NavigatorLog:
 
     def last(self) -> EpochLog:
         """The last epoch (views)."""
-        i = (self.count - 1) % self.length
-        return EpochLog(*(array[i] for array in self._ring))
+        return self._views[(self.count - 1) % self.length]
 
     def log(self, n_epochs: int | None = None) -> EpochLog:
         """The last ``n_epochs`` epochs, oldest first (copies)."""

@@ -314,7 +314,7 @@ class Filter:
         self.own, self.extra = np.zeros(m), None
         self.nis, self.n_rows, self.epochs, self._first = math.nan, 0, 0, 0
         self._ring = empty_log(log_length, n, m)
-        self._views = [EpochLog(*row) for row in zip(*self._ring)]
+        self._views = [EpochLog(*(array[i, ...] for array in self._ring)) for i in range(log_length)]
 
     def slot(self, t_s: float) -> EpochLog:
         """Views of the log's next row, of time ``t_s``."""
@@ -336,8 +336,7 @@ class Filter:
 
     def last(self) -> EpochLog:
         """The last epoch (views)."""
-        i = (self.epochs - 1) % self._ring.t_s.size
-        return self._views[i]._replace(t_s=self._ring.t_s[i])
+        return self._views[(self.epochs - 1) % self._ring.t_s.size]
 
     def correct(self, dx: np.ndarray | None, p: np.ndarray | None) -> None:
         """Between two epochs: inject dx = true - estimate, replace the covariance; what was logged is another filter's."""

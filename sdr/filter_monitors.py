@@ -5,8 +5,10 @@ from functools import lru_cache
 
 import numpy as np
 
+from monitors.bias_bank import chi2_limit
+from monitors.normal_points import NormalPoints
 from monitors.parallel_filters import BankReport, PacedBank
-from monitors.protection import chi2_limit
+from monitors.protection import innovation_ratios
 from nav.navlog import NavigatorLog
 from sdr.findings import Alarms, found
 from sdr.respond import Response
@@ -45,8 +47,9 @@ class FilterMonitors:
                 if name in self.alarms:
                     self.alarms[name].lack(watch.reason)
             return None, None
-        self._innovations(log, sample, t_s, out)
-        dx, p = self._parallel(watch, log, sample, t_s, out)
+        names, var = [str(n) for n, x in zip(log.names, log.seen) if x], self._variances(log)
+        self._innovations(log, names, var, sample, t_s, out)
+        dx, p = self._parallel(watch, log, names, var, sample, t_s, out)
         if p is not None and self._als is not None:
             self._als.restart()
             return dx, p
@@ -58,21 +61,19 @@ class FilterMonitors:
         if self._bank is not None:
             self._bank.moved(dx)
 
-    def _variances(self, log: NavigatorLog) -> np.ndarray:
+    def _variances(self, log: NavigatorLog | NormalPoints) -> np.ndarray:
         """(S,) range variances in force, of excluded satellites too: theirs are judged by what they would weigh."""
         return self.response.variance(log.names, log.own[: log.slots])
 
-    def _innovations(self, log, sample, t_s, out) -> None:
+    def _innovations(self, log, names, var, sample, t_s, out) -> None:
         if self.spec.innovation is None:
             return
-        rows = np.flatnonzero(log.seen[: log.slots])
-        h, limit = log.h[rows], chi2_limit(1, self.spec.innovation.p_false_alarm)
-        s = np.sum((h @ log.last().p) * h, axis=1) + self._variances(log)[rows]
-        names = [log.names[i] for i in rows]
-        out["innovation"] = part = found(names, sample, t_s, log.z[rows] ** 2 / s, limit)
+        ratio, limit = np.empty(len(names)), chi2_limit(1, self.spec.innovation.p_false_alarm)
+        innovation_ratios(log.h, log.last().p, log.z, var, log.seen, ratio)
+        out["innovation"] = part = found(names, sample, t_s, ratio, limit)
         # One satellite that stands out; when most do, the noise is wrong and no satellite is at fault.
         high = part["value"] > limit
-        if "innovation" in self.response.spec.exclude and 2 * high.sum() < len(rows):
+        if "innovation" in self.response.spec.exclude and 2 * high.sum() < len(names):
             self.response.accuse([n for n, x in zip(names, high) if x], t_s)
 
     # -- noise ----------------------------------------------------------------------------------------------------------
@@ -99,21 +100,21 @@ class FilterMonitors:
 
     # -- parallel filters -------------------------------------------------------------------------------------------------
 
-    def _parallel(self, watch, log, sample, t_s, out) -> tuple[np.ndarray | None, np.ndarray | None]:
+    def _parallel(
+        self, watch, log, names, var, sample, t_s, out
+    ) -> tuple[np.ndarray | None, np.ndarray | None]:
         spec = self.spec.parallel_filters
         if spec is None or not self._start(watch):
             return None, None
         assert self._bank is not None
         last, m = log.last(), log.slots
         seen = log.seen[:m]
-        raw = np.where(seen, log.z[:m] + self.response.shifts(log.names), 0.0)
-        report = self._bank(last.phi, last.qd, log.h[:m], raw, self._variances(log), seen, log.dx)
+        raw = log.z[:m] + self.response.shifts(log.names)
+        report = self._bank(last.phi, last.qd, log.h[:m], raw, var, seen, log.dx)
         if report is None:
             return None, None
         self.alarms["parallel_filters"].lack(self._bank.bank.unavailable)
-        rows = np.flatnonzero(seen)
-        names = [log.names[i] for i in rows]
-        out["parallel_filters"] = found(names, sample, t_s, report.stat_long[rows], spec.threshold)
+        out["parallel_filters"] = found(names, sample, t_s, report.stat_long[seen], spec.threshold)
         return self._act(log, report)
 
     def _start(self, watch: Watched) -> bool:

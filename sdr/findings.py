@@ -29,7 +29,6 @@ PROTECTION = np.dtype(
     ]
 )
 """Protection levels of one position and the alert limits."""
-_CODES = 256
 
 
 def split(name: str) -> tuple[bytes, int]:
@@ -38,16 +37,24 @@ def split(name: str) -> tuple[bytes, int]:
 
 
 @lru_cache(maxsize=256)
-def _columns(names: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
-    return np.array([split(n)[0] for n in names], "S1"), np.array([split(n)[1] for n in names], np.int32)
-
-
-def found(names, sample: int, t_s: float, value, threshold, estimate_m=np.nan, rivals=b"") -> np.ndarray:
-    """INTEGRITY rows of satellites ``names``; the rest are columns or scalars."""
+def _blank(names: tuple[str, ...]) -> np.ndarray:
+    """Rows with the satellites alone."""
     rows = np.zeros(len(names), INTEGRITY)
-    rows["system"], rows["prn"] = _columns(tuple(names))
-    rows["sample_index"], rows["t_s"], rows["rivals"] = sample, t_s, rivals
-    rows["value"], rows["threshold"], rows["estimate_m"] = value, threshold, estimate_m
+    rows["estimate_m"] = np.nan
+    for row, name in zip(rows, names):
+        row["system"], row["prn"] = split(name)
+    return rows
+
+
+def found(names, sample: int, t_s: float, value, threshold, estimate_m=None, rivals=b"") -> np.ndarray:
+    """INTEGRITY rows of satellites ``names``; the rest are columns or scalars."""
+    rows = _blank(tuple(names)).copy()
+    rows["sample_index"], rows["t_s"] = sample, t_s
+    rows["value"], rows["threshold"] = value, threshold
+    if estimate_m is not None:
+        rows["estimate_m"] = estimate_m
+    if rivals:
+        rows["rivals"] = rivals
     return rows
 
 
@@ -59,15 +66,17 @@ class Alarms:
         self.found: dict[tuple[bytes, int], list[dict[str, Any]]] = {}
         self.unavailable_epochs = 0
         self.reason: str | None = None
-        self._tests, self._threshold = np.zeros(_CODES, np.int64), np.zeros(_CODES)
+        self._tested: dict[tuple[bytes, bytes], tuple[int, np.ndarray]] = {}
 
     def add(self, rows: np.ndarray) -> None:
         """Rows of one epoch."""
         self.reason = None
-        code = np.where(rows["system"] == b"G", 0, _CODES // 2) + rows["prn"]
-        self._tests[code] += 1
-        self._threshold[code] = rows["threshold"]
-        for row in rows[rows["value"] >= rows["threshold"]]:
+        # Of the same satellites as before, mostly: they are counted together and named in the report.
+        who = rows["system"].tobytes(), rows["prn"].tobytes()
+        count, _ = self._tested.pop(who, (0, rows))
+        self._tested[who] = count + 1, rows["threshold"]
+        over = rows["value"] >= rows["threshold"]
+        for row in rows[over] if over.any() else ():
             key = bytes(row["system"]), int(row["prn"])
             mine, t, value = self.found.setdefault(key, []), float(row["t_s"]), float(row["value"])
             if mine and t - mine[-1]["end_s"] <= self.gap_s:
@@ -86,17 +95,26 @@ class Alarms:
     def report(self, name: str, p_fa: float | None) -> list[dict[str, Any]]:
         """One row per satellite that was tested; a monitor that never could gives one row with the reason."""
         head = {"name": name, "unavailable": self.reason, "unavailable_epochs": self.unavailable_epochs}
-        tested = np.flatnonzero(self._tests)
-        if not len(tested):
+        tested = self._tests()
+        if not tested:
             none = {"signal": "", "prn": 0, "threshold": None, "p_fa": p_fa, "tests": 0, "alarms": []}
             return [head | none]
         out = []
-        for code in tested:
-            system, prn = divmod(int(code), _CODES // 2)
-            row = {"signal": ("L1CA", "E1C")[system], "prn": prn, "threshold": float(self._threshold[code])}
-            counts = {
-                "tests": int(self._tests[code]),
-                "alarms": self.found.get((b"GE"[system : system + 1], prn), []),
-            }
+        for (system, prn), (tests, threshold) in sorted(
+            tested.items(), key=lambda item: (item[0][0] != b"G", item[0])
+        ):
+            row = {"signal": "L1CA" if system == b"G" else "E1C", "prn": prn, "threshold": threshold}
+            counts = {"tests": tests, "alarms": self.found.get((system, prn), [])}
             out.append(head | row | {"p_fa": p_fa} | counts)
+        return out
+
+    def _tests(self) -> dict[tuple[bytes, int], tuple[int, float]]:
+        """(tests, last threshold) by satellite."""
+        out: dict[tuple[bytes, int], tuple[int, float]] = {}
+        for (systems, prns), (count, threshold) in self._tested.items():
+            for system, prn, limit in zip(
+                np.frombuffer(systems, "S1"), np.frombuffer(prns, np.int32), threshold
+            ):
+                key = bytes(system), int(prn)
+                out[key] = out.get(key, (0, 0.0))[0] + count, float(limit)
         return out

@@ -113,7 +113,9 @@ class IntegrityLive:
     def _log_epochs(self) -> int:
         return 0 if self.spec.als is None else self.spec.als.window_epochs + self.spec.als.settle_epochs
 
-    def hear(self, channels: dict[tuple[str, int], int], epochs: np.ndarray, counts: np.ndarray, loops) -> None:
+    def hear(
+        self, channels: dict[tuple[str, int], int], epochs: np.ndarray, counts: np.ndarray, loops
+    ) -> None:
         """New integrations of all channels, see ``DiscriminatorNoise.hear``."""
         if self._noise is not None:
             self._noise.hear(channels, epochs, counts, loops)

@@ -9,9 +9,10 @@ import math
 
 import numpy as np
 
-from monitors.bias_bank import BiasBank, BiasReport, parity_weight
+from monitors.bias_bank import BiasBank, BiasReport, chi2_limit, parity_weight
 from monitors.normal_points import NormalPoints
-from monitors.protection import chi2_limit, quick_levels
+from monitors.protection import quick_levels
+from monitors.raim import isolate
 from monitors.separate_bias import BiasRemoval, Removal
 from nav.frames import geodetic_from_ecef, rotation_enu_to_ecef
 from nav.navigator import Snapshot
@@ -62,7 +63,7 @@ class RangeMonitors:
     def _raim(self, snap, h, var, sample, t_s, out) -> None:
         if self.spec.raim is None:
             return
-        accused, first, reason = self._isolate(snap.residual_m, h, var)
+        accused, first, reason = isolate(snap.residual_m, h, var, self.spec.raim.p_false_alarm)
         if first is None:
             self.alarms["raim"].lack(reason)
             return
@@ -76,23 +77,6 @@ class RangeMonitors:
             self._fall_back(snap, h, var, t_s)
         if "raim" in self.response.spec.exclude and not reason:
             self.response.accuse([snap.names[i] for i in accused] + rivals, t_s)
-
-    def _isolate(self, residual, h, var):
-        """(suspects in the order in which they were left out, (chi2 / limit, first suspect) or None, why it ended)."""
-        part, accused, first = list(range(len(residual))), list[int](), None
-        while True:
-            try:
-                w, dof = parity_weight(h[part], var[part])
-            except ValueError as error:
-                return accused, first, str(error).replace("The bias bank needs", "RAIM needs")
-            wr = w @ residual[part]
-            chi2, limit = float(residual[part] @ wr), chi2_limit(dof, self.spec.raim.p_false_alarm)
-            suspect = part[int(np.argmax(wr**2 / np.maximum(np.diag(w), 1e-12 / var[part])))]
-            first = first or (chi2 / limit, suspect)
-            if chi2 < limit:
-                return accused, first, ""
-            accused.append(suspect)
-            part.remove(suspect)
 
     def _fall_back(self, snap, h, var, t_s) -> None:
         """Keep to the constellation that agrees with itself, if exactly one does."""
@@ -207,24 +191,29 @@ class BiasTracker:
     def __init__(self, spec: BiasBank) -> None:
         self.spec, self.names = spec, list[str]()
         self.run = spec.start(1)
+        self._heard, self._at = list[str](), np.zeros(0, np.int64)
 
     def __call__(self, names, raw, h, var, used) -> BiasReport | None:
         """One epoch of satellites ``names``; see ``BiasBankRun``."""
+        if names != self._heard:
+            self._seat(names)
+        at, m = self._at, len(self.names)
+        r, hh, v, take = np.zeros(m), np.zeros((m, h.shape[1])), np.ones(m), np.zeros(m, bool)
+        r[at], hh[at], v[at], take[at] = raw, h, var, used
+        return self.run(r, hh, v, take)
+
+    def _seat(self, names) -> None:
+        """A place in the bank for every satellite that has none, and the place of each of ``names``."""
         new = [n for n in names if n not in self.names]
         if new:
             first = not self.names
             self.names += new
             self.run = self.spec.start(len(self.names)) if first else self.run.grown(len(self.names))
-        at = np.array([self.names.index(n) for n in names])
-        m = len(self.names)
-        r, hh, v, take = np.zeros(m), np.zeros((m, h.shape[1])), np.ones(m), np.zeros(m, bool)
-        r[at], hh[at], v[at], take[at] = raw, h, var, used
-        return self.run(r, hh, v, take)
+        self._heard, self._at = list(names), np.array([self.names.index(n) for n in names])
 
     def suspect(self, report: BiasReport) -> tuple[str, float, float]:
         """(satellite, probability of its bias or 0 when it does not fit, bias in m) of the most probable bias."""
-        biased = np.flatnonzero(report.bias_m != 0)
-        best = int(biased[np.argmax(report.probability[biased])])
+        best = 1 + int(np.argmax(report.probability[1:]))  # the first is that of no bias
         value = float(report.probability[best]) if report.fits or report.best != best else 0.0
         return self.names[int(report.row[best])], value, float(report.bias_m[best])
 
