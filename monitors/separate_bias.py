@@ -20,6 +20,8 @@ from nav.eskf import EpochLog
 
 RATE_SIGMA_MPS = 1.0
 """A priori sigma of a drifting offset: the ramps of seed 001, 0.5 to 2 ft/s, and more."""
+RECENT, SPARSE = 50, 4
+"""An onset may be any of the last so many epochs; before them, every so manieth."""
 NEGLIGIBLE = 1e-9
 """Onsets of less than this share of the largest weight are forgotten."""
 
@@ -154,8 +156,10 @@ class BiasRemoval:
         """An offset of ``name`` that began in one of the last epochs, whose ``innovations`` are given."""
         run = SeparateBias(log.names.index(name), log.dx.size, self.tau_m)
         part = log.log(min(len(innovations), log.count, log.length))
-        for k, (r, dt_s) in enumerate(innovations[-part.n_epochs :]):
-            run(EpochLog(*(array[k] for array in part)), r, dt_s, onset=True)
+        n = part.n_epochs
+        for k, (r, dt_s) in enumerate(innovations[-n:]):
+            onset = n - k <= RECENT or k % SPARSE == 0
+            run(EpochLog(*(array[k] for array in part)), r, dt_s, onset)
         return run
 
     def _end(self, log) -> Removal:

@@ -20,8 +20,8 @@ from nav.navlog import NavigatorLog
 from sdr.findings import PROTECTION, Alarms, found
 from sdr.respond import Response
 
-MEMORY = 200
-"""Epochs in which the onset of an offset may lie: 40 s at 5 Hz."""
+MEMORY = 400
+"""Epochs in which the onset of an offset may lie: 80 s at 5 Hz."""
 RECENT = 50
 """Epochs over which rivals are weighed."""
 ODDS = 99.0

@@ -98,6 +98,8 @@ def check_range(kind, size, low, high, runs):
     assert nearest == rate or binomtest(missed, clean, nearest).pvalue > 5.7e-7, (rate, low, high)
     expected_early = 0.11 if kind == "noisy" else 0.015
     assert binomtest(early, runs, expected_early, alternative="greater").pvalue > 5.7e-7
+    if kind == "noisy":
+        assert binomtest(early, runs, 0.04, alternative="less").pvalue > 5.7e-7
 
 
 @pytest.mark.parametrize(("kind", "size", "low", "high"), RANGES[1:3] + RANGES[6:8] + RANGES[9:10])

@@ -112,8 +112,8 @@ def test_noise_goes_into_the_steering_filter():
     """GPS six times as noisy as believed: sigma within 5 / sqrt(2 N), NIS within 20 %, a better position."""
     true_m = np.where(np.arange(N) < N // 2, 30.0, 5.0)
     on = {"als": ALL["als"]}
-    (a, a_nis, _), _, _, _ = fly(on, seconds=40.0, sigma_m=true_m)
-    (b, b_nis, _), run, rows, _ = fly(on, {"noise": "als"}, seconds=40.0, sigma_m=true_m)
+    (a, a_nis, *_), _, _, _ = fly(on, seconds=40.0, sigma_m=true_m)
+    (b, b_nis, *_), run, rows, _ = fly(on, {"noise": "als"}, seconds=40.0, sigma_m=true_m)
     late = slice(1300, None)
     # Three quarters of the rows are as believed: (36 + 3) / 4.
     assert a_nis[late].mean() > 8 and 0.8 < b_nis[late].mean() < 1.2
@@ -129,7 +129,7 @@ def test_a_bias_is_named_and_removed_and_undone():
     monitors = {"bias_bank": GRID}
     clean = fly(monitors, seconds=30.0)[0][0]
     off = fly(monitors, seconds=30.0, fault=fault)[0][0]
-    (on, nis, _), run, _, sky = fly(monitors, {"bias": True}, seconds=30.0, fault=fault)
+    (on, nis, *_), run, _, sky = fly(monitors, {"bias": True}, seconds=30.0, fault=fault)
     assert list(first(run, "bias_bank")) == ["G04"] and first(run, "bias_bank")["G04"] < 13.0
     # Ranges of one look, sigma^2 / 10, judged by parity alone, which knows less than the filter.
     look = np.column_stack([-sky.filter.los[:N], np.ones(N), sky.second[:N]])
@@ -169,7 +169,7 @@ def test_a_ramp_is_named_excluded_and_undone():
     fault = lambda t: one(1, 0.6 * max(t - 10.0, 0.0))  # noqa: E731
     monitors = {"parallel_filters": ALL["parallel_filters"], "bank_every": 5, "raim": None}
     off = fly(monitors, seconds=60.0, fault=fault)[0][0]
-    (on, nis, _), run, rows, sky = fly(
+    (on, nis, *_), run, rows, sky = fly(
         monitors, {"exclude": ["parallel_filters"], "reset": True}, seconds=60.0, fault=fault
     )
     found = first(run, "parallel_filters")
