@@ -154,7 +154,7 @@ def table_2_rows(runs, js_db: float) -> list[dict]:
                 claim = TABLE_2[kind][mode][i]
                 verdict = "reproduced" if low <= claim <= high else "not reproduced"
                 note = f"jam only {np.nanmedian(jam):.3g}; 95 % of runs {low:.3g} to {high:.3g}" + _why(
-                    mode, claim, low
+                    mode, claim, high
                 )
                 head = f"Table 2 at J/S {js_db:g} dB: {item} {kind} {label}"
                 found.append(row(head, claim, *interval(ours), verdict, note))
@@ -171,14 +171,14 @@ def _columns(js_db: float) -> list[tuple[str, str, str]]:
     ]
 
 
-def _why(mode: str, claim: float, low: float) -> str:
+def _why(mode: str, claim: float, high: float) -> str:
     if mode == "scalar":
         return (
             "; free divergence without lock detectors depends on nothing physical; with them ours says no fix"
         )
     if mode == "vector":
         return "; J/S chosen by Pos2D rms"
-    return "; ours is better" if claim > low else ""
+    return "; ours is better" if claim > high else ""
 
 
 def side_by_side(runs, js_db: float, path: Path) -> Path:
