@@ -30,6 +30,8 @@ from signals.modulation import SIGNALS
 from tracking.correlator_model import Twin, TwinCW, code_spectrum
 
 MAX_POINTS = 20_000
+NAME = r"^[A-Za-z0-9][A-Za-z0-9 ._+-]*$"
+"""Names of campaigns become names of files in the working directory."""
 MAX_FILE_BYTES = 1 << 20
 CURVE_BINS = 20
 """Bins of P_MD against |df| T, from 0 to 1."""
@@ -176,7 +178,7 @@ class CampaignSpec(_Spec):
 
     schema_: Annotated[int, Field(alias="schema", ge=1, le=1)] = 1
     """Version of this file's layout."""
-    name: str = Field(min_length=1, max_length=100)
+    name: str = Field(max_length=100, pattern=NAME)
     """Name of the campaign and of its results file."""
     description: str = ""
     """One sentence for lists."""
@@ -330,8 +332,7 @@ class Campaign:
         tables = json.loads(json.dumps({"twin": self.spec.twin, "jammer": self.spec.jammer}))
         for path, value in setting.items():
             _set(tables, path, value)
-        label = _label(setting) or "the only point"
-        where = f"{self.spec.name}, point {index} ({label})"
+        where = f"{self.spec.name}, point {index} ({_label(setting)})"
         twin, jammer = tables["twin"], tables["jammer"]
         if twin.get("multipath") == "none":
             twin["multipath"] = None
@@ -431,7 +432,7 @@ def empty_trial(monitors: int, point: int, trial: int) -> np.ndarray:
 
 
 def _label(setting: dict[str, Any]) -> str:
-    return ", ".join(f"{k} = {v}" for k, v in setting.items())
+    return ", ".join(f"{k} = {v}" for k, v in setting.items()) or "the only point"
 
 
 def load(name_or_path: str, overrides: tuple[str, ...] = ()) -> Any:

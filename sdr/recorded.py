@@ -20,6 +20,7 @@ from monitors.threshold import requirement
 from sdr import iffile, inject
 from sdr.campaign import (
     MAX_POINTS,
+    NAME,
     THRESHOLD,
     Count,
     Length,
@@ -37,7 +38,7 @@ from signals.frontend import FrontEndSpec
 from signals.jammers import JammerSpec
 from tracking.channel import STATE_LOCKED
 
-_WINDOW, _JAMMER = 0, 1
+_WINDOW, _JAMMER, _QUANTISER = 0, 1, 2
 """Children of a trial's seed."""
 
 
@@ -65,7 +66,7 @@ class RecordedSpec(_Spec):
 
     schema_: Annotated[int, Field(alias="schema", ge=1, le=1)] = 1
     """Version of this file's layout."""
-    name: str = Field(min_length=1, max_length=100)
+    name: str = Field(max_length=100, pattern=NAME)
     """Name of the campaign and of its results file."""
     description: str = ""
     """One sentence for lists."""
@@ -206,7 +207,7 @@ class _Window:
         self.n_samples = round(window_s * source.fs_hz)
         draw = np.random.Generator(np.random.Philox(_child(seed, _WINDOW)))
         self._first = int(draw.integers(0, source.n_samples - self.n_samples + 1))
-        self._rms = inject._noise_rms(source, Path(recording.file))
+        self._recorded = inject.Recorded(source, Path(recording.file), _child(seed, _QUANTISER))
         self._runs = [
             j.start(self.fs_hz, self.if_hz, window_s, _child(seed, _JAMMER, k)) for k, j in enumerate(jammers)
         ]
@@ -217,7 +218,7 @@ class _Window:
     def read(self, n: int) -> tuple[int, np.ndarray]:
         """The next slab of at most ``n`` samples."""
         n0, n = self._at, min(n, self.n_samples - self._at)
-        iq = inject._read(self._source, self._first + n0, n, self._rms)
+        iq = self._recorded.read(self._first + n0, n)
         for run in self._runs:
             run.add(iq, n0)
         self._at += n

@@ -64,6 +64,7 @@ def _statistic(ax: Any, rows: np.ndarray, limits: np.ndarray, name: str, colors:
     ax.axhline(1.0, color="k", lw=0.8, ls="--", zorder=4)
     ax.set_yscale("symlog", linthresh=2.0)
     ax.set_ylim(bottom=-1.5)
+    ax.set_yticks([y for y in (-1, 0, 1, 10, 100, 1000) if y <= ax.get_ylim()[1]])
     ax.yaxis.set_major_formatter("{x:g}")
     ax.yaxis.set_minor_formatter("")
 

@@ -1,5 +1,11 @@
 """Campaigns over recordings: windows, jammers and counts that replay, whatever the workers."""
 
+import json
+import os
+import signal
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -73,6 +79,48 @@ def test_a_point_without_jammer_counts_false_alarms(recording, tmp_path):
     quiet = table(recording, jammer={"kind": "none"}, grid={}, stop={"max_trials": 1, "definition": "all"})
     (point,) = farm.execute(from_table(quiet), tmp_path / "q.h5", workers=1)["points"]
     assert point["definition"] == "false_alarm" and point["n"] > 500 and point["rate"] < 0.01
+
+
+DIES = """
+import json, os, signal, sys
+from sdr import campaign, farm
+text, out, after = sys.argv[1], farm.Path(sys.argv[2]), int(sys.argv[3])
+keep, kept = farm.Results.keep, []
+def dies(self, rows):
+    keep(self, rows)
+    kept.append(rows)
+    if len(kept) == after:
+        self._journal.write(b"R half a record")
+        self._journal.flush()
+        os.kill(os.getpid(), signal.SIGKILL)
+farm.Results.keep = dies
+farm.execute(campaign.from_table(json.loads(text)), out, workers=2)
+"""
+
+
+def test_killed_resumed_and_with_other_workers_it_ends_the_same(recording, tmp_path):
+    """SIGKILL right after the first and after the second chunk that was kept, in the middle of the next record."""
+    many = table(recording, stop={"max_trials": 4, "definition": "all", "min_trials": 4})
+    one, out = tmp_path / "one.h5", tmp_path / "killed.h5"
+    expected = farm.execute(from_table(many), one, workers=1)
+    kept = 0
+    for after in (1, 2):
+        died = subprocess.run(
+            [sys.executable, "-c", DIES, json.dumps(many), str(out), str(after)],
+            env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
+        )
+        assert died.returncode == -signal.SIGKILL
+        with farm.Results(from_table(many), out) as begun:
+            assert kept < begun.resumed < 8 and not begun.complete
+            kept = begun.resumed
+    result = farm.execute(from_table(many), out, workers=2)
+    assert result["resumed_trials"] == kept and result["complete"]
+    assert not out.with_name("killed.h5.journal").exists()
+    told = [{**p, "output": ""} for p in result["points"]]
+    assert told == [{**p, "output": ""} for p in expected["points"]]
+    with store.read(one) as a, store.read(out) as b:
+        for name in ("trials", "points", "rates"):
+            assert a[f"campaign/{name}"][:].tobytes() == b[f"campaign/{name}"][:].tobytes(), name
 
 
 @pytest.mark.parametrize(
