@@ -412,12 +412,26 @@ def page_word(even: np.ndarray, odd: np.ndarray) -> tuple[int, bool]:
     return message_of(np.concatenate((even[2:114], odd[2:18]))), crc_ok
 
 
+def _find(symbols: np.ndarray) -> int:
+    """First place where a whole good page begins: two sync patterns, and its CRC; -1 if there is none."""
+    n = symbols.size - PAGE_SYMBOLS + 1
+    single = np.correlate(np.where(symbols < 0, -1, 1), SYNC_SIGNS.astype(np.int64), "valid")
+    double = single[: max(n, 0)] + single[PART_SYMBOLS : PART_SYMBOLS + max(n, 0)]
+    for first in np.flatnonzero(np.abs(double) >= 16).tolist():
+        even, _ = decode_part(symbols[first : first + PART_SYMBOLS])
+        odd, _ = decode_part(symbols[first + PART_SYMBOLS : first + PAGE_SYMBOLS])
+        if even[0] == 0 and odd[0] == 1 and page_word(even, odd)[1]:
+            return first
+    return -1
+
+
 class Decoder:
     """I/NAV symbols of one satellite to time, ephemeris, health, ionosphere and GGTO.
 
     Symbols may be inverted as a whole: the sync pattern of each part tells. A place is accepted as the start
     of a page if two sync patterns 250 symbols apart fit (at most two wrong of 20) and the CRC of the page
-    between holds; time counts once two words agree on it.
+    between holds; time counts once two words agree on it, or the later one says that up to a minute is missing
+    between them: a hole in the samples.
 
     Parameters
     ----------
@@ -439,6 +453,7 @@ class Decoder:
     symbol_ms = SYMBOL_MS
     symbols_per_week = SECONDS_PER_WEEK * 1000 // SYMBOL_MS
     lost_after = 5  # pages that fail in a row
+    longest_hole = 15_000  # symbols
 
     def __init__(self, prn: int):
         self.prn = prn
@@ -454,6 +469,7 @@ class Decoder:
         self.pages_ok = self.pages_failed = self.pages_alert = 0
         self.words: dict[int, int] = {}
         self._symbols = np.empty(0, np.float32)
+        self._before = np.empty(0, np.float32)  # the page that was read last
         self._index = 0  # of self._symbols[0]
         self._missed = 0
         self._phase: int | None = None  # confirmed: symbols since the start of the week at index 0
@@ -512,7 +528,7 @@ class Decoder:
         return events
 
     def _restart(self, index0: int) -> None:
-        self._symbols, self._index = np.empty(0, np.float32), index0
+        self._symbols, self._before, self._index = np.empty(0, np.float32), np.empty(0, np.float32), index0
         self.synced, self.polarity, self._missed = False, 0, 0
         if self._phase is not None:
             self._phase_candidate, self._phase = self._phase, None
@@ -527,23 +543,19 @@ class Decoder:
         n = self._symbols.size - PAGE_SYMBOLS + 1
         if n <= 0:
             return False
-        signs = np.where(self._symbols < 0, -1, 1)
-        single = np.correlate(signs, SYNC_SIGNS.astype(np.int64), "valid")
-        double = single[:n] + single[PART_SYMBOLS : PART_SYMBOLS + n]
-        for first in np.flatnonzero(np.abs(double) >= 16):
-            even, _ = decode_part(self._symbols[first : first + PART_SYMBOLS])
-            odd, _ = decode_part(self._symbols[first + PART_SYMBOLS : first + PAGE_SYMBOLS])
-            if even[0] == 0 and odd[0] == 1 and page_word(even, odd)[1]:
-                self._drop(int(first))
-                self.synced, self._missed = True, 0
-                return True
-        self._drop(n)
-        return False
+        first = _find(self._symbols)
+        if first < 0:
+            self._drop(n)
+            return False
+        self._drop(first)
+        self.synced, self._missed = True, 0
+        return True
 
     def _page(self) -> tuple[str, int, int, bool]:
         index = self._index
         even, _ = decode_part(self._symbols[:PART_SYMBOLS])
         odd, polarity = decode_part(self._symbols[PART_SYMBOLS:PAGE_SYMBOLS])
+        before, self._before = self._before, self._symbols[:PAGE_SYMBOLS]
         self._drop(PAGE_SYMBOLS)
         word, crc_ok = page_word(even, odd)
         paired = even[0] == 0 and odd[0] == 1
@@ -558,9 +570,21 @@ class Decoder:
             return "page", -1, index, False
         self.pages_failed += 1
         self._missed += 1
+        self._mind_holes(before)
         if self._missed >= self.lost_after:
             self.synced = False
         return "page", -1, index, False
+
+    def _mind_holes(self, before: np.ndarray) -> None:
+        """Where a page failed and a good one begins before it: symbols are missing, and time waits for the next word."""
+        both = np.concatenate((before, self._before))
+        first = _find(both[1:]) + 1
+        if self._phase is None or not 0 < first < before.size:
+            return
+        self._phase_candidate, self._phase = self._phase, None
+        self._symbols = np.concatenate((both[first:], self._symbols))
+        self._index -= both.size - first
+        self._missed = 0
 
     def _take(self, number: int, word: int, index: int) -> None:
         if number not in WORDS or number == 63:
@@ -583,12 +607,16 @@ class Decoder:
             self._take_almanac(number, values, word)
 
     def _take_time(self, values: dict[str, float], index: int) -> None:
-        """Keep the time of a word: candidate first, confirmed when a second word says the same."""
+        """Keep the time of a word: candidate first, confirmed when a second word agrees; else time is unknown."""
         if values["gst_tow_s"] >= SECONDS_PER_WEEK:
             return
         phase = (int(values["gst_tow_s"]) * PART_SYMBOLS - index) % self.symbols_per_week
-        if phase == self._phase_candidate:
-            self._phase = phase
+        if self._phase_candidate is not None:
+            missing = (phase - self._phase_candidate) % self.symbols_per_week
+            self._phase = phase if missing <= self.longest_hole else None
+            if missing and self._week_anchor is not None:
+                week, anchor, _ = self._week_anchor
+                self._week_anchor = week, anchor - missing, phase
         self._phase_candidate = phase
         if "gst_week" in values:
             self._week_anchor = (int(values["gst_week"]) + GST_WEEK_0, index, phase)

@@ -405,7 +405,7 @@ class Decoder:
     Bits may be inverted as a whole (half cycle of the carrier): the preamble tells, and parity undoes it. A
     place is accepted as the start of a subframe if preamble, parity of words 1 and 2, their trailing zeros
     and the agreement of subframe number and TOW allow it (chance 1e-7 per bit); time counts once two headers
-    agree on it.
+    agree on it, or the later one says that up to a minute is missing between them: a hole in the samples.
 
     Parameters
     ----------
@@ -427,6 +427,7 @@ class Decoder:
     symbol_ms = BIT_MS
     symbols_per_week = SECONDS_PER_WEEK * 1000 // BIT_MS
     lost_after = 3  # subframes without a valid header
+    longest_hole = 3000  # bits
 
     def __init__(self, prn: int, first_week: int = FIRST_WEEK):
         self.prn = prn
@@ -442,7 +443,9 @@ class Decoder:
         self.synced = False
         self.words_ok = self.words_failed = self.subframes_ok = self.subframes_failed = 0
         self._bits = np.empty(0, np.uint8)
+        self._before = np.empty(0, np.uint8)  # the subframe that was read last
         self._index = 0  # of self._bits[0]
+        self._sought = -1  # index of the subframe whose header was looked for elsewhere
         self._missed = 0
         self._phase: int | None = None  # confirmed: symbols since the start of the week at index 0
         self._phase_candidate: int | None = None
@@ -497,7 +500,7 @@ class Decoder:
         return events
 
     def _restart(self, index0: int) -> None:
-        self._bits, self._index = np.empty(0, np.uint8), index0
+        self._bits, self._before, self._index = np.empty(0, np.uint8), np.empty(0, np.uint8), index0
         self.synced, self.polarity, self._missed = False, 0, 0
         if self._phase is not None:
             self._phase_candidate, self._phase = self._phase, None
@@ -508,16 +511,36 @@ class Decoder:
     def _advance(self) -> bool:
         """Move to the start of a subframe; False if none is in sight."""
         if self.synced:
+            self._mind_holes()
             return True
         first, polarity = _find(self._bits, 0)
         if first < 0:
             self._drop(max(self._bits.size - 59, 0))
             return False
+        self._sync(first, polarity)
+        return True
+
+    def _sync(self, first: int, polarity: int) -> None:
         self._drop(first)
         self.synced, self.polarity, self._missed = True, polarity, 0
         message, _ = self._read(2)
         self._accept_header(unpack(HEADER, message, SUBFRAME_BITS), self._index)
-        return True
+
+    def _mind_holes(self) -> None:
+        """Where no header stands at its place, but one before it: bits are missing, which nothing else tells."""
+        if self._bits.size < 60 or self._sought == self._index or self._phase is None:
+            return
+        self._sought = self._index
+        if _find(self._bits[:60], 0)[0] == 0:
+            return
+        earlier = np.concatenate((self._before, self._bits[:60]))
+        first, polarity = _find(earlier, 1)
+        if first > 0:
+            self._bits, self._index = (
+                np.concatenate((self._before, self._bits)),
+                self._index - self._before.size,
+            )
+            self._sync(first, polarity)
 
     def _read(self, n_words: int) -> tuple[int, np.ndarray]:
         """Subframe as an upright integer from its first words, and which pass parity; sets polarity."""
@@ -545,6 +568,7 @@ class Decoder:
         self.subframes_failed += not ok
         if ok:
             self._take(number, message, index)
+        self._before = self._bits[:SUBFRAME_BITS]
         self._drop(SUBFRAME_BITS)
         # a place never confirmed by a second header was a chance one
         if self._missed >= (1 if self._phase is None else self.lost_after):
@@ -552,18 +576,30 @@ class Decoder:
         return "subframe", number, index, ok
 
     def _accept_header(self, header: dict[str, float], index: int) -> bool:
-        """Check the header, keep its time: a candidate first, confirmed by a second header that agrees."""
+        """Check the header, keep its time: a candidate first, confirmed by a second header that agrees.
+
+        One that does not leaves time unknown.
+        """
         count = (int(header["tow_count"]) - 1) % SUBFRAMES_PER_WEEK
         if header["preamble"] != PREAMBLE or header["tow_count"] >= SUBFRAMES_PER_WEEK:
             return False
         if header["subframe"] != count % 5 + 1:
             return False
         phase = (count * SUBFRAME_BITS - index) % self.symbols_per_week
-        if phase == self._phase_candidate and index != self._candidate_index:
-            self._phase = phase
+        if index != self._candidate_index:
+            self._confirm(phase)
         self._phase_candidate, self._candidate_index = phase, index
         self.alert = bool(header["alert"])
         return True
+
+    def _confirm(self, phase: int) -> None:
+        if self._phase_candidate is None:
+            return
+        missing = (phase - self._phase_candidate) % self.symbols_per_week
+        self._phase = phase if missing <= self.longest_hole else None
+        if missing and self._phase is not None and self._week_anchor is not None:
+            week, anchor, _ = self._week_anchor
+            self._week_anchor = week, anchor - missing, phase
 
     def _take(self, number: int, message: int, index: int) -> None:
         if number <= 3:

@@ -286,6 +286,50 @@ def test_false_alarm_rate_is_the_one_set(signal, fs_hz, spec, ms, slabs):
     assert binom.ppf(2.5e-4, searches, 0.75 * p_fa) <= false <= binom.ppf(1 - 2.5e-4, searches, 1.2 * p_fa)
 
 
+def detection_probability(cn0_dbhz, threshold, terms, lag, doppler_bins, per_chip, draws=20_000):
+    """P(the largest of 3 x 3 cells about the signal exceeds): (1 / K) sum |s + n|^2 of jointly Gaussian cells.
+
+    Cells correlate as 1 - |code| and sinc(Doppler T) exp(i pi Doppler T), and the signal with a cell as a cell at its
+    own place would. Off-peak correlation of the code, 1/1023 of the power, adds to the floor. ``lag`` in samples,
+    ``doppler_bins`` in bins of 1 / (2 T): the losses between cells are in it.
+    """
+    rng = np.random.default_rng(5)
+    k, d = (g.ravel() for g in np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0]))
+    k, d = np.append(k, lag), np.append(d, doppler_bins)
+    turns = 0.5 * np.subtract.outer(d, d)
+    cov = (1 - np.abs(np.subtract.outer(k, k)) / per_chip) * np.sinc(turns) * np.exp(1j * np.pi * turns)
+    root = np.linalg.cholesky(cov[:9, :9] + 1e-12 * np.eye(9))
+    snr = 10 ** (cn0_dbhz / 10) * 1e-3
+    noise = (
+        rng.standard_normal((draws, terms, 9)) + 1j * rng.standard_normal((draws, terms, 9))
+    ) / math.sqrt(2)
+    cells = noise @ root.T + math.sqrt(snr) * cov[:9, 9]
+    statistic = np.mean(np.abs(cells) ** 2, axis=1) / (1 + snr / 1023)
+    return float(np.mean(statistic.max(axis=1) > threshold))
+
+
+@pytest.mark.parametrize("terms, levels_dbhz", [(1, (41.0, 43.0, 45.0)), (10, (33.0, 35.0, 37.0))])
+@pytest.mark.parametrize("lag, doppler_bins", [(0.0, 0.0), (0.5, 0.5)])
+def test_detection_probability_is_that_of_theory(terms, levels_dbhz, lag, doppler_bins):
+    """On a cell and in the middle between cells, where code and Doppler cost 1.1 and 0.9 dB; exact to z = 5."""
+    fs_hz, trials, rng = 4.096e6, 150, np.random.default_rng(22)
+    n = round(terms * 1e-3 * fs_hz)
+    spec = AcquisitionSpec(non_coherent=terms, doppler_range_hz=1000.0)
+    chips, doppler_hz = -(700 + lag) * CHIP_RATE_HZ / fs_hz, 500.0 * doppler_bins
+    for cn0_dbhz in levels_dbhz:
+        found = 0
+        for _ in range(trials):
+            sat = satellite("L1CA", 9, fs_hz, n, doppler_hz, chips % 1023, cn0_dbhz, rng, symbols=False)
+            row = acquire(slab([sat], n, rng), 0, fs_hz, 0.0, "L1CA", [9], spec)[0]
+            found += bool(row["acquired"])
+        p = detection_probability(
+            cn0_dbhz, float(row["threshold"]), terms, lag, doppler_bins, fs_hz / CHIP_RATE_HZ
+        )
+        print(f"{cn0_dbhz} dB-Hz, {terms} blocks: {found} of {trials}, theory {p:.3f}")
+        # The floor is estimated from a bin's own 4096 cells: 1 / sqrt(4096 K / 4) of the statistic at z = 1.
+        assert abs(found / trials - p) < 5 * math.sqrt(max(p * (1 - p), 1 / trials) / trials) + 0.02
+
+
 def test_bad_input_is_refused_in_one_sentence():
     noise = np.random.default_rng(21).standard_normal((2, 60_000)).astype(np.float32)
     broken = noise.copy()

@@ -261,6 +261,20 @@ def test_gap_drops_time_until_a_word_agrees() -> None:
     assert decoder.tow_of(0) == 90_000
 
 
+@pytest.mark.parametrize("missing", [1, 25, 249, 375, 500, 1100])
+def test_a_hole_that_no_index_tells_is_seen_at_the_next_page(missing: int) -> None:
+    """Symbols vanish and the count goes on: no time from the page that fails, the right one from the next time word."""
+    decoder, symbols = inav.Decoder(5), stream(120, 0)
+    at = 250 * 60 + 333
+    decoder.feed(symbols[:at], 0)
+    assert decoder.tow_of(0) == 0 and decoder.week == WEEK
+    decoder.feed(symbols[at + missing : 250 * 70], at)
+    # Whole pages are missed by nothing but time.
+    assert decoder.synced and (decoder.tow_of(0) in (None, 4 * missing) or missing % 500 == 0)
+    decoder.feed(symbols[250 * 70 : 250 * 90], 250 * 70 - missing)
+    assert decoder.tow_of(0) == 4 * missing and decoder.week_of(at) == WEEK
+
+
 def test_half_cycle_slip_costs_one_page() -> None:
     symbols, decoder = stream(60, 1), inav.Decoder(5)
     symbols[250 * 10 + 130 :] *= -1

@@ -239,6 +239,21 @@ def test_gap_drops_time_until_a_header_agrees() -> None:
     assert decoder.week == WEEK
 
 
+@pytest.mark.parametrize("at, missing", [(700, 1), (700, 7), (850, 75), (700, 300), (700, 650)])
+def test_a_hole_that_no_index_tells_is_seen_at_the_next_header(at: int, missing: int) -> None:
+    """Bits vanish and the count goes on: time, and week, are right from the first whole header after them."""
+    decoder, bits = lnav.Decoder(5), stream(60)
+    decoder.feed(1.0 - 2.0 * bits[:at], 0)
+    assert decoder.tow_of(0) == 0 and decoder.week is not None
+    rest = bits[at + missing :]
+    header = -(-(at + missing) // 300) * 300 - at - missing + 60
+    decoder.feed(1.0 - 2.0 * rest[: header - 1], at)
+    assert decoder.tow_of(0) == 0
+    decoder.feed(1.0 - 2.0 * rest[header - 1 : header + 240], at + header - 1)
+    assert decoder.tow_of(0) == 20 * missing and decoder.week_of(at) == WEEK
+    assert decoder.synced and decoder.subframes_ok > 0
+
+
 def test_half_cycle_slip_costs_the_word_it_hits() -> None:
     bits = stream(60, 0).astype(np.float32)
     bits[6 * 50 * 2 + 100 :] *= -1  # in word 4 of subframe 3

@@ -82,7 +82,7 @@ def test_a_restarted_channel_does_not_continue_the_count():
     assert tracker.add(sat.acquisition(tracker._end)) == c
     telemetry.start(c)
     assert telemetry.reference(c) == (0, -1)
-    assert telemetry._index(c, 0) >= end + 1000
+    assert telemetry._index(c, 0) > end
     assert list(telemetry.slipped([c], [0])) == [True] and list(telemetry.slipped([c], [0])) == [False]
 
 

@@ -10,7 +10,7 @@ from tracking.lock import STATE_LOCKED
 __all__ = ["Telemetry"]
 
 _ORBIT = ("week", "toe_s", "sqrt_a_sqrt_m", "e", "m0_rad", "omega0_rad", "i0_rad", "af0_s")
-_GAP = 1000  # symbols: a restarted channel must not continue the count of the one before
+_GAP = 2  # symbols, fewer than passed: a restarted channel must not continue the count of the one before
 
 
 class Telemetry:
@@ -32,8 +32,8 @@ class Telemetry:
         self.decoders = {}
         self._base = {}  # channel -> symbol index of its code period 0
         self._end = {}  # satellite -> next symbol index
-        self._heard = {}  # channel -> (code periods, soft symbols) that wait to be decoded
-        self._slips = {}  # satellite -> slips at the last call of slipped
+        self._heard = []  # (symbols, counts) of the slabs that wait to be decoded
+        self._slips = {}  # satellite -> (slips, transmit time of symbol 0) at the last call of slipped
         self._tail = {}  # Galileo satellite -> last nine symbol signs, while its pages are not synchronised
         self._matches = {}  # Galileo satellite -> [upright, inverted] sync patterns seen meanwhile
 
@@ -52,21 +52,22 @@ class Telemetry:
 
     def hear(self):
         """Keep the symbols of the last ``Tracker.process`` until ``decode``: a few slabs together cost little more."""
-        for c in np.flatnonzero(self.tracker.symbol_counts).tolist():
-            rows = self.tracker.symbols[c, : self.tracker.symbol_counts[c]]
-            self._heard.setdefault(c, []).append((rows["code_period"], rows["soft"]))
+        self._heard.append((self.tracker.symbols, self.tracker.symbol_counts))
 
     def decode(self):
         """Decode what was heard, before a channel changes hands at the latest -> list of (channel, event)."""
-        heard, self._heard = self._heard, {}
+        heard, self._heard = [(symbols, counts.tolist()) for symbols, counts in self._heard], []
         events = []
-        for c, parts in heard.items():
+        for c in range(max((len(counts) for _, counts in heard), default=0)):
+            parts = [symbols[c, : counts[c]] for symbols, counts in heard if c < len(counts) and counts[c]]
+            if not parts:
+                continue
             if c not in self._base:
                 self.start(c)
-            index = self._index(c, np.concatenate([periods for periods, _ in parts]))
+            index = self._index(c, np.concatenate([rows["code_period"] for rows in parts]))
             sign = np.float32(-1.0 if self.tracker.channels["kind"][c] == KIND_PILOT else 1.0)
-            symbols = sign * np.concatenate([soft for _, soft in parts])
-            events += [(c, e) for e in self._feed(self._satellite(c), index, symbols)]
+            soft = sign * np.concatenate([rows["soft"] for rows in parts])
+            events += [(c, e) for e in self._feed(self._satellite(c), index, soft)]
         return events
 
     def _feed(self, key, index, symbols):
@@ -130,12 +131,13 @@ class Telemetry:
                 rows["tow_s"] = (tow_s + rows["code_phase_chips"] / 1.023e6) % 604_800.0
 
     def slipped(self, channels, slips):
-        """Whether each channel slipped a cycle since the last call; a channel not asked before did."""
+        """Whether each channel slipped a cycle, or its time moved, since the last call; a channel not asked before did."""
         out = np.zeros(len(channels), bool)
         for k, c in enumerate(channels):
             key = self._satellite(int(c))
-            out[k] = self._slips.get(key) != int(slips[k])
-            self._slips[key] = int(slips[k])
+            now = int(slips[k]), self.decoders[key].tow_of(0) if key in self.decoders else None
+            out[k] = self._slips.get(key) != now
+            self._slips[key] = now
         return out
 
     def ephemerides(self):
@@ -160,7 +162,8 @@ class Telemetry:
         self.decoders.pop((system, prn), None)
         for c in [c for c in self._base if self._satellite(c) == (system, prn)]:
             del self._base[c]
-            self._heard.pop(c, None)
+            for _, counts in self._heard:
+                counts[c : c + 1] = 0
 
     def iono_utc(self, system):
         """IONO_UTC record of the most complete decoder of ``system`` ("G" or "E"); None before anything came."""
