@@ -190,6 +190,67 @@ def test_shift_follows_the_injection_of_a_feedback_filter():
         b.shift(report.x)
 
 
+def barometer_in_the_transition(runs, epochs, baro_var=9.0, told_var=VAR, true_var=VAR):
+    """The live Pinson filter: a barometer update inside the prediction, ranges after it, everything fed back.
+
+    Returns its log's phi, qd, h, K, the innovations of ``runs`` simulated histories (runs, T, m) and its corrections (runs, T, n).
+    """
+    phi, qd, h, baro, _, _, p0 = problem(5, 1, 17)
+    p0[10:12, 10:12] = np.diag(
+        [0.1, 0.1]
+    )  # a barometer and a clock that are known: the height is what it tells
+    rng, n, m = np.random.default_rng(18), 13, 5
+    p, error = p0.copy(), rng.normal(size=(runs, 13)) * np.sqrt(np.diag(p0))
+    root, log, r, dx = eskf.psd_root(qd), [], np.empty((runs, epochs, m)), np.empty((runs, epochs, n))
+    for t in range(epochs):
+        p = phi @ p @ phi.T + qd
+        k = p @ baro / (baro @ p @ baro + baro_var)
+        a = np.eye(n) - np.outer(k, baro)
+        seen = a @ phi, a @ qd @ a.T + baro_var * np.outer(k, k)
+        p = a @ p @ a.T + baro_var * np.outer(k, k)
+        gain = p @ h.T @ np.linalg.inv(h @ p @ h.T + told_var * np.eye(m))
+        log.append((*seen, gain, p.copy()))
+        p = p - gain @ h @ p
+        error = error @ phi.T + rng.normal(size=(runs, n)) @ root.T
+        error -= np.outer(error @ baro + math.sqrt(baro_var) * rng.normal(size=runs), k)
+        r[:, t] = error @ h.T + math.sqrt(true_var) * rng.normal(size=(runs, m))
+        dx[:, t] = r[:, t] @ gain.T
+        error = error - dx[:, t]
+    return log, h, p0, r, dx
+
+
+@pytest.mark.parametrize(("runs", "epochs"), [(1500, 1), (120, 40)])
+def test_a_barometer_inside_the_prediction_leaves_the_statistics_true(runs, epochs):
+    """Detection filters that see the barometer as part of the transition: mean of r^2/A is 1, at the start and later (z = 5)."""
+    log, h, p0, r, dx = barometer_in_the_transition(runs, epochs, baro_var=0.01)
+    q = []
+    for run in range(runs):
+        bank = ParallelFilters(r0_m2=0.0).start(5, p0)
+        for t, (phi, qd, _, _) in enumerate(log):
+            bank(phi, qd, h, r[run, t], np.full(5, VAR))
+            bank.shift(dx[run, t])
+        q.append([bank.resid[1 + 3 * s, s] ** 2 / bank.resid_var[1 + 3 * s, s] for s in range(5)])
+    assert abs(np.mean(q) - 1) < 5 * math.sqrt(2 / runs)
+
+
+def test_als_with_a_barometer_inside_the_prediction():
+    """Ranges of four times the believed variance: found from the log as it is, within z = 5; not if the barometer were left out."""
+    from monitors import als
+
+    true = 4.0 * VAR
+    log, h, _, r, _ = barometer_in_the_transition(300, 150, baro_var=0.01, true_var=true)
+    phi, qd, gain, prior = (np.array(a) for a in zip(*log))
+    empty = eskf.empty_log(150, 13, 5)
+    epochs = empty._replace(
+        phi=phi, qd=qd, h=np.tile(h, (150, 1, 1)), k=gain, p=prior, var=np.full((150, 5), VAR)
+    )
+    epochs.used[:] = True
+    sample = np.mean([als.autocovariance(x, epochs.used, 2, 50) for x in r], axis=0)
+    found = np.diag(als.solve(als.als_model(epochs, settle=50), sample).r_cov_m2)
+    # 300 histories of 100 epochs; innovations' variance is a little above R.
+    assert np.all(np.abs(found / true - 1) < 5 * 1.3 * math.sqrt(2 / 30_000))
+
+
 def test_bank_speed_against_one_filter():
     """37 filters of 12 satellites cost less than 60 single compiled filter epochs (a ratio in one run)."""
     m = 12
