@@ -168,9 +168,10 @@ def _read_text(path: Path, limit: int) -> str:
 
 
 def _read_sigmf(meta: Path) -> Declaration:
+    text = _read_text(meta, _MAX_META_BYTES)
     try:
-        content = json.loads(_read_text(meta, _MAX_META_BYTES))
-    except (json.JSONDecodeError, RecursionError) as err:
+        content = json.loads(text)
+    except (ValueError, RecursionError) as err:  # ValueError: of JSON, or an integer of thousands of digits
         raise ValueError(f"'{meta}' is not JSON: it cannot be read as SigMF metadata") from err
     head = content.get("global") if isinstance(content, dict) else None
     captures = content.get("captures") if isinstance(content, dict) else None

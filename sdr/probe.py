@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sdr import guess, iffile
-from signals.constants import CYCLES_PER_CHIP
+from signals.constants import CYCLES_PER_CHIP, F_L1_HZ
 from signals.modulation import SIGNALS
 from tracking.acquisition import AcquisitionSpec, acquire
 
@@ -23,6 +23,11 @@ LOOK_S = 1.0
 SPUR_DB = 10.0
 MUCH_BETTER = 1.5
 """Another reading must find so many times as much as the declared one to be believed instead."""
+
+FAR_HZ = (20e3, 170e3)
+"""Half widths of the searches for a recorder whose clock is far off, 13 and 100 ppm, where the usual one finds nothing."""
+OFF_HZ = 6e3
+"""Middle of the Dopplers from which the clock is off, and not the receiver in motion."""
 
 
 def probe(path: Path, recording: "Recording", figures: Path | None = None) -> dict[str, Any]:
@@ -190,21 +195,37 @@ def inversion(
 
 
 def _satellites(iq: np.ndarray, fs_hz: float, if_hz: float) -> list[dict[str, Any]]:
-    found: list[dict[str, Any]] = []
-    window = iq[:, : int(0.1 * fs_hz)]
-    for signal, prns in (("L1CA", range(1, 33)), ("E1C", range(1, 37))):
+    """Satellites of the first tenth of a second; where there are none, of a recorder whose clock is far off."""
+    found = _search(iq, fs_hz, if_hz, AcquisitionSpec(), ("L1CA", "E1C"))
+    for wide_hz in FAR_HZ if not found else ():
+        far = _search(iq, fs_hz, if_hz, AcquisitionSpec(doppler_range_hz=wide_hz), ("L1CA",))
+        if len(far) > 1:
+            near = AcquisitionSpec(doppler_center_hz=_center_hz(far))
+            return _search(iq, fs_hz, if_hz, near, ("L1CA", "E1C"))
+    return found
+
+
+def _search(
+    iq: np.ndarray, fs_hz: float, if_hz: float, spec: AcquisitionSpec, signals: tuple[str, ...]
+) -> list[dict[str, Any]]:
+    window, names = (
+        iq[:, : int(0.1 * fs_hz)],
+        ("doppler_hz", "code_phase_chips", "cn0_dbhz", "statistic", "threshold"),
+    )
+    found = []
+    for signal in signals:
+        prns = spec.gps_prns if signal == "L1CA" else spec.galileo_prns
         if window.shape[1] < 2 * fs_hz * SIGNALS[signal].code_period_s:
             continue
-        for row in acquire(window, 0, fs_hz, if_hz, signal, list(prns), AcquisitionSpec()):
-            if row["acquired"]:
-                found.append(
-                    {"signal": signal, "prn": int(row["prn"])}
-                    | {
-                        k: float(row[k])
-                        for k in ("doppler_hz", "code_phase_chips", "cn0_dbhz", "statistic", "threshold")
-                    }
-                )
+        rows = acquire(window, 0, fs_hz, if_hz, signal, list(prns), spec)
+        for row in rows[rows["acquired"]]:
+            found.append({"signal": signal, "prn": int(row["prn"])} | {k: float(row[k]) for k in names})
     return found
+
+
+def _center_hz(satellites: list[dict[str, Any]]) -> float:
+    """Doppler of the recorder's clock: the middle of the satellites', to 100 Hz."""
+    return round(float(np.median([s["doppler_hz"] for s in satellites])), -2) + 0.0
 
 
 def _advice(path: Path, result: dict[str, Any], conjugated: bool, tried: list[str]) -> str:
@@ -236,7 +257,14 @@ def _advice(path: Path, result: dict[str, Any], conjugated: bool, tried: list[st
             f"strongest spur {result['spurs'][0]['level_db']:.0f} dB above the floor at {result['spurs'][0]['freq_hz']:.0f} Hz"
         )
     options = f"--format {declaration['format']} --fs-hz {declaration['fs_hz']:.10g} --if-hz {declaration['if_hz']:.10g}"
-    parts.append(f"gnssbb receive {path} {options}" + (" --conjugate" if declaration["inverted"] else ""))
+    options += " --conjugate" if declaration["inverted"] else ""
+    if sats and abs(center_hz := _center_hz(sats)) > OFF_HZ:
+        parts.append(
+            f"the recorder's clock is {abs(center_hz) / F_L1_HZ * 1e6:.1f} ppm off: Dopplers centre on {center_hz:+.0f} Hz"
+        )
+        upright_hz = -center_hz if bool(declaration["inverted"]) != conjugated else center_hz
+        options += f" --set receiver.acquisition.doppler_center_hz={upright_hz:.0f}"
+    parts.append(f"gnssbb receive {path} {options}")
     return "; ".join(parts)
 
 

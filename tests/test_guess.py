@@ -1,11 +1,12 @@
 """What bytes tell of a stranger's recording: formats on noise of many shapes, and a capture that is declared wrongly."""
 
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from sdr import guess, iffile, probe
+from sdr import guess, iffile, jobs, probe
 from sdr.__main__ import Recording
 
 CAPTURE = Path(__file__).resolve().parents[2] / "shared" / "data" / "real" / "L1_20211202_084700_4MHz_IQ.bin"
@@ -70,3 +71,13 @@ def test_wrong_declaration_is_put_right(declared, monkeypatch):
     assert (told["format"], told["fs_hz"], told["inverted"]) == ("ci8", 4e6, True)
     assert "--format ci8 --fs-hz 4000000 --if-hz 0 --conjugate" in result["advice"]
     assert "declared" in result["advice"]
+
+
+def test_a_clock_far_off_is_found_and_said(tmp_path):
+    over = ["clock={drift_s_s=6e-5}", "front_end.fs_hz=2.6e6", "duration_s=0.5"]
+    made = jobs.simulate("demo", tmp_path / "off", overrides=over, quiet=True)
+    result = probe.probe(tmp_path / "off.sigmf-meta", Recording())
+    assert len(result["satellites"]) >= 5 and result["declaration"]["inverted"] is False
+    # 60 ppm of 1575.42 MHz; the middle of satellites within 5 kHz of it.
+    center = re.search(r"doppler_center_hz=(-?\d+)", result["advice"])
+    assert center and abs(float(center[1]) + 94_525) < 5000, made

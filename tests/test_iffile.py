@@ -288,6 +288,16 @@ GOOD_META = {
 HOSTILE = [
     ("not json", "is not JSON"),
     ("[" * 100_000, "is not JSON"),
+    ('{"global": {"core:sample_rate": ' + "9" * 5000 + '}, "captures": []}', "is not JSON"),
+    (
+        '{"global": {"core:datatype": "ci8", "core:sample_rate": 1e999}, "captures": []}',
+        "core:sample_rate must be",
+    ),
+    ({**GOOD_META, "global": {**GOOD_META["global"], "core:datatype": "ci16_be"}}, "convert to one of ci8"),
+    (
+        {**GOOD_META, "global": {**GOOD_META["global"], "core:sample_rate": 10**300}},
+        "core:sample_rate must be",
+    ),
     ("[]", "lacks the objects"),
     ({"global": {}, "captures": 3}, "lacks the objects"),
     ({**GOOD_META, "captures": [1]}, "must be a JSON object"),
