@@ -137,6 +137,7 @@ class IntegrityLive:
             self._ranges(snap, sample, t_s, out)
         filter_monitors = self._monitors_of(watch)
         dx, p = filter_monitors(watch, sample, t_s, out)
+        self._name_rivals(out.get("parallel_filters"))
         self._noise_rows(watch, snap, sample, t_s, out)
         for name, rows in out.items():
             if name in self.alarms:
@@ -159,6 +160,12 @@ class IntegrityLive:
         if self._filter is None or self._filter[0] is not watch:
             self._filter = watch, FilterMonitors(self.spec, self.response, self.alarms, watch.slots)
         return self._filter[1]
+
+    def _name_rivals(self, rows: np.ndarray | None) -> None:
+        """Beside whom the parallel filters accuse, those that the ranges do not tell from it."""
+        for i in () if rows is None else np.flatnonzero(rows["value"] >= rows["threshold"]):
+            name = f"{rows['system'][i].decode()}{rows['prn'][i]:02d}"
+            rows["rivals"][i] = " ".join(self._ranges.rivals(name)).encode()
 
     def _noise_rows(self, watch: Watched, snap: Snapshot | None, sample: int, t_s: float, out) -> None:
         """Noise by redundant measurements, which is that of one integration; a normal point is the mean of several."""

@@ -9,13 +9,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from monitors.bias_bank import projector
+from monitors.bias_bank import parity_weight, projector
 from monitors.normal_points import NormalPoints
 from nav.eskf import Eskf
 from nav.navlog import Remedy
 from nav.steering import LEFT_OUT
 from sdr import scenario
 from sdr.integrity import IntegritySpec
+from sdr.range_monitors import Ranges
 from sdr.receiver import Receiver
 from sdr.reproduce.live import FS_HZ, N, fly
 from sdr.respond import RespondSpec
@@ -204,9 +205,47 @@ def test_rivals_are_named_until_the_fault_tells_them_apart():
         for k in range(20):
             raw = np.random.default_rng(k).standard_normal(7)
             raw[0] += size * (k >= 19)
-            ranges._past.append((names, raw, h, ones))
+            ranges._past.append(Ranges(names, raw, h, ones))
         got[size] = ranges.rivals("G01")
     assert got[40.0] == [] and "G02" in got[4.0]
+
+
+def test_rivals_are_those_of_the_likelihoods_written_out():
+    """2 ln L = (sum s_k (W r)_i)^2 / sum s_k^2 W_ii over biases and ramps since every fourth epoch; a satellite comes and goes."""
+    ranges, rng = IntegritySpec().start(RespondSpec(), FS_HZ)._ranges, np.random.default_rng(2)
+    az, el = np.radians(45.0 * np.arange(8) + 20 * rng.random(8)), np.radians(rng.uniform(15, 70, 8))
+    h = np.column_stack(
+        [-np.cos(el) * np.sin(az), -np.cos(el) * np.cos(az), -np.sin(el), np.ones(8), np.zeros(8)]
+    )
+    names = [f"G{k + 1:02d}" for k in range(8)]
+    for k in range(40):
+        part = np.flatnonzero((np.arange(8) != 3) | (k % 7 > 2))
+        raw = rng.standard_normal(8) + 0.02 * k * (np.arange(8) == 1)
+        ranges._past.append(Ranges([names[i] for i in part], raw[part], h[part], np.ones(len(part))))
+    table = np.zeros((2, 40, 8))
+    for k, e in enumerate(ranges._past):
+        w = parity_weight(e.h, e.var)[0]
+        table[:, k, [names.index(n) for n in e.names]] = w @ e.raw, np.diag(w)
+    best = np.zeros(8)
+    for begin in range(0, 40, 4):
+        for shape in (np.ones(40 - begin), np.arange(1.0, 41 - begin)):
+            best = np.maximum(best, (shape @ table[0, begin:]) ** 2 / (shape**2 @ table[1, begin:]))
+    want = [n for n, b in zip(names, best) if n != "G02" and b > best[1] - 2 * np.log(99.0)]
+    assert ranges.rivals("G02") == want and 0 < len(want) < 7
+
+
+def test_parallel_filters_name_whom_they_may_mean():
+    """Every alarm carries the satellites that the range monitors find as likely."""
+    fault = lambda t: one(1, 0.6 * max(t - 10.0, 0.0))  # noqa: E731
+    _, run, rows, _ = fly(
+        {"parallel_filters": ALL["parallel_filters"], "bank_every": 5}, seconds=45.0, fault=fault
+    )
+    high = rows["parallel_filters"][rows["parallel_filters"]["value"] >= 90.0]
+    assert len(high) and np.all(high["prn"] == 2)
+    run._ranges.rivals = lambda name: ["E01", "G07"]
+    more = high[-1:].copy()
+    run._name_rivals(more)
+    assert more["rivals"][0] == b"E01 G07"
 
 
 # ------------------------------------------------------------------------------------------------------- on IF samples
