@@ -218,27 +218,47 @@ def weigh(log_p, wr, own, row, bias_m, log_floor):
 
 
 @njit(cache=True, nogil=True)
-def bank_epoch(log_p, chi2, w, r, used, row, bias_m, log_floor):
-    """One epoch of a bank: ``w`` (k, k) of the k satellites of ``used`` (m,); ``chi2`` (M,) <- that of each hypothesis."""
-    m = used.size
-    wr, own = np.zeros(m), np.zeros(m)
+def bank_epoch(log_p, chi2, count, at, w, r, row, bias_m, log_floor):
+    """One epoch of a bank: ``w`` (k, k), ``r`` (k,) of the satellites in its places ``at`` (k,).
+
+    ``chi2`` (F, M) ring of the last epochs' chi-square of each hypothesis, of which ``count`` were before. Returns the most
+    probable hypothesis and its sum.
+    """
+    places = row.max() + 1
+    wr, own = np.zeros(places), np.zeros(places)
     null = 0.0
-    i = 0
-    for a in range(m):
-        if not used[a]:
-            continue
-        j = 0
-        for b in range(m):
-            if used[b]:
-                wr[a] += w[i, j] * r[b]
-                j += 1
-        null += r[a] * wr[a]
-        own[a] = w[i, i]
-        i += 1
+    for i in range(at.size):
+        for j in range(at.size):
+            wr[at[i]] += w[i, j] * r[j]
+        null += r[i] * wr[at[i]]
+        own[at[i]] = w[i, i]
     weigh(log_p, wr, own, row, bias_m, log_floor)
-    for h in range(row.size):
-        s, mu = row[h], bias_m[h]
-        chi2[h] = null - 2 * mu * wr[s] + mu * mu * own[s]
+    now = count % chi2.shape[0]
+    for i in range(row.size):
+        s, mu = row[i], bias_m[i]
+        chi2[now, i] = null - 2 * mu * wr[s] + mu * mu * own[s]
+    best = np.argmax(log_p)
+    total = 0.0
+    for e in range(min(count + 1, chi2.shape[0])):
+        total += chi2[e, best]
+    return best, total
+
+
+@njit(cache=True, nogil=True)
+def ranges_epoch(log_p, chi2, dof, count, at, r, h, var, used, row, bias_m, log_floor):
+    """``bank_epoch`` of satellites (m,) in places ``at``, those ``used`` (m,), from their rows ``h`` (m, n) and variances.
+
+    ``dof`` (F,) ring of degrees of freedom. Returns (most probable, its chi-square, degrees of freedom), (-1, 0, 0) and
+    nothing changed where ``parity_weight`` would refuse.
+    """
+    u = np.flatnonzero(used)
+    w = np.empty((u.size, u.size))
+    rank, columns = whitened_parity(h[u], var[u], w)
+    if not enough(rank, u.size, columns):
+        return -1, 0.0, 0
+    dof[count % dof.size] = u.size - rank
+    best, total = bank_epoch(log_p, chi2, count, at[u], w, r[u], row, bias_m, log_floor)
+    return best, total, dof[: min(count + 1, dof.size)].sum()
 
 
 @njit(cache=True, nogil=True)
@@ -378,23 +398,33 @@ class BiasBankRun:
         """
         m = r.size
         used = np.ones(m, dtype=np.bool_) if used is None else np.asarray(used, dtype=np.bool_)
-        u = np.flatnonzero(used)
+        if np.ndim(r_cov) == 1:
+            return self.ranges(np.arange(m), r, h, r_cov, used)
+        u, slot = np.flatnonzero(used), self._count % self.spec.fit_epochs
         try:
-            if np.ndim(r_cov) == 1:
-                part, dof = parity_weight(h[u], np.asarray(r_cov)[u])
-            else:
-                part = weight_matrix(h[u], np.asarray(r_cov)[np.ix_(u, u)])
-                dof = u.size - np.linalg.matrix_rank(h[u], tol=SINGULAR)
+            w = weight_matrix(h[u], np.asarray(r_cov)[np.ix_(u, u)])
         except (ValueError, np.linalg.LinAlgError) as error:
             self.unavailable = str(error)
             return None
-        self.unavailable = None
-        slot = self._count % self.spec.fit_epochs
-        r = np.ascontiguousarray(r, np.float64)
-        bank_epoch(self.log_p, self._chi2[slot], part, r, used, self.row, self.bias_m, self._log_floor)
-        self._dof[slot] = dof
-        self._count += 1
-        return self._report()
+        self._dof[slot] = u.size - np.linalg.matrix_rank(h[u], tol=SINGULAR)
+        hypotheses = self.row, self.bias_m, self._log_floor
+        best, chi2 = bank_epoch(self.log_p, self._chi2, self._count, u, w, r[u], *hypotheses)
+        return self._report(best, chi2, int(self._dof[: self._count + 1].sum()))
+
+    def ranges(self, at: np.ndarray, r: np.ndarray, h: np.ndarray, var: np.ndarray, used: np.ndarray):
+        """The same of satellites in places ``at`` of the bank, all arrays in their order, ``var`` (m,) variances."""
+        r, h, var = (np.ascontiguousarray(a, dtype=np.float64) for a in (r, h, var))
+        hypotheses = self.row, self.bias_m, self._log_floor
+        best, chi2, dof = ranges_epoch(
+            self.log_p, self._chi2, self._dof, self._count, at, r, h, var, used, *hypotheses
+        )
+        if best < 0:
+            try:
+                parity_weight(h[used], var[used])
+            except ValueError as error:
+                self.unavailable = str(error)
+            return None
+        return self._report(best, chi2, dof)
 
     def grown(self, m: int) -> "BiasBankRun":
         """A bank for ``m`` satellite slots, the first of which carry on as here."""
@@ -407,13 +437,12 @@ class BiasBankRun:
         run._dof[:], run._count = self._dof, self._count
         return run
 
-    def _report(self) -> BiasReport:
-        held = min(self._count, self.spec.fit_epochs)
-        best = int(np.argmax(self.log_p))
-        chi2, dof = float(self._chi2[:held, best].sum()), int(self._dof[:held].sum())
+    def _report(self, best: int, chi2: float, dof: int) -> BiasReport:
+        self.unavailable = None
+        self._count += 1
         fits = chi2 <= chi2_limit(dof, self.spec.fit_p_false)
         likely = self.log_p[best] > math.log(self.spec.declare)
-        declared = bool(likely and fits and self.bias_m[best] != 0.0)
+        declared = bool(likely and fits and best != 0)
         return BiasReport(np.exp(self.log_p), self.row, self.bias_m, best, fits, declared, chi2, dof)
 
     def correction_m(self, report: BiasReport) -> np.ndarray:

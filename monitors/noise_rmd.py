@@ -32,16 +32,17 @@ def window_variance(ring, count, scheme, decay):
     """
     n = min(count, ring.size)
     acc = 0.0
-    norm = 0.0
-    weight = 1.0
-    for age in range(n):
-        d = ring[(count - 1 - age) % ring.size]
-        acc += weight * d * d
-        norm += weight
-        if scheme == AGE_WEIGHTED:
+    if scheme == AGE_WEIGHTED:
+        norm, weight = 0.0, 1.0
+        for age in range(n):
+            d = ring[(count - 1 - age) % ring.size]
+            acc += weight * d * d
+            norm += weight
             weight *= decay
-    if scheme == PRINTED:
-        norm = n - 1.0
+    else:
+        for i in range(n):
+            acc += ring[i] * ring[i]
+        norm = n - 1.0 if scheme == PRINTED else float(n)
     return acc / norm if norm > 0.0 else math.nan
 
 
@@ -130,15 +131,14 @@ class NoiseRmdRun:
 
 
 @njit(cache=True, nogil=True)
-def follow(epochs, counts, slot, ring, done, last):
+def follow(first, samples, state, error, cn0, bandwidth, counts, slot, ring, done, last):
     """Differences of successive code discriminators of all channels of a slab, in chips, into ``ring`` (S, N).
 
-    ``epochs``: columns ``COLUMNS`` of EPOCH, each (C, n); ``counts`` (C,) of them valid; ``slot`` (C,) row of each channel, -1:
-    none. ``done`` (S,) differences so far; ``last`` (S, 6): sample after the last integration in lock (-1: none), its
+    Columns of EPOCH, each (C, n); ``counts`` (C,) of them valid; ``slot`` (C,) row of each channel, -1: none.
+    ``done`` (S,) differences so far; ``last`` (S, 6): sample after the last integration in lock (-1: none), its
     discriminator, and of the newest integration its samples, C/N0 (dB-Hz), loop bandwidth (Hz) and whether it was in lock
     (-1: nothing new).
     """
-    first, samples, state, error, cn0, bandwidth = epochs
     for c in range(counts.size):
         s = slot[c]
         if s < 0 or counts[c] == 0:
@@ -163,9 +163,6 @@ def window_variances(ring, done, scheme, decay, out):
         out[s] = window_variance(ring[s], done[s], scheme, decay)
 
 
-COLUMNS = ("sample_index", "n_samples", "state", "code_error_chips", "cn0_dbhz", "dll_bw_hz")
-
-
 class DiscriminatorNoise:
     """Range variance of channels from differences of their successive code discriminators, without a second channel.
 
@@ -186,7 +183,10 @@ class DiscriminatorNoise:
         ``loops``: the TrackingSpec."""
         if channels != self._channels or len(counts) != len(self._slot):
             self._seat(channels, len(counts), loops)
-        follow(tuple(epochs[c] for c in COLUMNS), counts, self._slot, self._ring, self._done, self._last)
+        follow(
+            epochs["sample_index"], epochs["n_samples"], epochs["state"], epochs["code_error_chips"], epochs["cn0_dbhz"],
+            epochs["dll_bw_hz"], counts, self._slot, self._ring, self._done, self._last,
+        )  # fmt: skip
 
     def _seat(self, channels, n_channels, loops) -> None:
         """A row for every satellite that has none, and the row of each channel."""
@@ -208,12 +208,13 @@ class DiscriminatorNoise:
         mean = np.empty(len(self._names))
         window_variances(self._ring, self._done, SCHEMES[self.spec.scheme], self.spec.decay, mean)
         out = {}
-        for s in np.flatnonzero((self._last[:, 5] > 0) & (self._done >= self.spec.window)).tolist():
-            name, (spacing, bw_hz) = self._names[s], self._loops[s]
-            _, _, samples, cn0_dbhz, now_hz, _ = self._last[s].tolist()
-            t_s = samples / self.fs_hz
-            share = _share(name[0], spacing, round(cn0_dbhz), t_s, 0.0 if steered else now_hz or bw_hz)
-            out[name] = float(mean[s]) * METRES_PER_CHIP**2 * share + self.spec.r0_m2
+        rows = zip(self._names, self._loops, self._done.tolist(), self._last.tolist(), mean.tolist())
+        for name, (spacing, bw_hz), done, (_, _, samples, cn0_dbhz, now_hz, locked), chips2 in rows:
+            if locked <= 0 or done < self.spec.window:
+                continue
+            bw_hz = 0.0 if steered else now_hz or bw_hz
+            share = _share(name[0], spacing, round(cn0_dbhz), samples / self.fs_hz, bw_hz)
+            out[name] = chips2 * METRES_PER_CHIP**2 * share + self.spec.r0_m2
         self._last[:, 5] = -1.0
         return out
 

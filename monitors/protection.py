@@ -169,13 +169,13 @@ def _missed(threshold: float, dof: int) -> tuple[np.ndarray, np.ndarray]:
     return bias, chndtr(threshold, dof, np.maximum(bias**2, 1e-12))
 
 
-def _unit_tail(vertical: bool, level, shift):
-    """``_vertical_tail`` and ``_horizontal_tail`` of unit sigma."""
+def _unit_tail(vertical: bool):
+    """``_vertical_tail`` or ``_horizontal_tail`` of unit sigma, a function of level and shift."""
     from scipy.special import chndtr, ndtr
 
     if vertical:
-        return ndtr(shift - level) + ndtr(-shift - level)
-    return 1.0 - chndtr(level**2, 2, np.maximum(shift**2, 1e-12))
+        return lambda level, shift: ndtr(shift - level) + ndtr(-shift - level)
+    return lambda level, shift: 1.0 - chndtr(level**2, 2, np.maximum(shift**2, 1e-12))
 
 
 @lru_cache(maxsize=4096)
@@ -190,15 +190,15 @@ def _unit_level(vertical: bool, k: int, allowed: float, threshold: float, dof: i
     bias, missed = _missed(threshold, dof)
     live = missed > allowed
     shift, may = SLOPE_STEP**k * bias[live], allowed / missed[live]
-    low = high = 0.0
+    tail, low, high = _unit_tail(vertical), 0.0, 0.0
     worst = int(np.argmax(shift - ndtri(may))) if shift.size else 0
     while shift.size:
         high = float(shift[worst] + 4.0 - ndtri(may[worst] / 4))
         while high - low > 1e-4 * high:
             middle = 0.5 * (low + high)
-            over = _unit_tail(vertical, middle, shift[worst]) > may[worst]
+            over = tail(middle, shift[worst]) > may[worst]
             low, high = (middle, high) if over else (low, middle)
-        ratio = _unit_tail(vertical, high, shift) / may
+        ratio = tail(high, shift) / may
         low, left = high, ratio > 1.0
         shift, may, ratio = shift[left], may[left], ratio[left]
         worst = int(np.argmax(ratio)) if ratio.size else 0

@@ -7,6 +7,7 @@ filter is only watched: recording changes nothing in it.
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 
 from nav import eskf_kernels, kernels
 from nav.eskf import EpochLog, empty_log
@@ -42,6 +43,28 @@ class Remedy(NamedTuple):
         return np.array([keys.get((bytes(s), int(n)), -1) for s, n in zip(system, prn)], dtype=int)
 
 
+@njit(cache=True, nogil=True)
+def record(at, los, second, innovation, variance, own, used, z, h, own_all, seen, r_used, h_used, var, took):
+    """One update into the rows of its slots ``at`` (n,), -1: none; see ``NavigatorLog.updated``. Outputs have 2S rows."""
+    n, slots = at.size, z.size // 2
+    for array in (z, r_used):
+        array[:] = 0.0
+    h[:], h_used[:], own_all[:], var[:], seen[:], took[:] = 0.0, 0.0, 1.0, 1.0, False, False
+    for part in range(2):
+        for i in range(n):
+            if at[i] < 0:
+                continue
+            row, mine = at[i] + part * slots, i + part * n
+            z[row], own_all[row], var[row], seen[row] = innovation[mine], own[mine], variance[mine], True
+            for j in range(3):
+                h[row, 3 * part + j] = -los[i, j]
+            h[row, 6 + part] = 1.0
+            if part == 0:
+                h[row, 8] = second[i]
+            if used[mine] > 0:
+                took[row], r_used[row], h_used[row] = True, z[row], h[row]
+
+
 class NavigatorLog:
     """Ring of the last epochs of the navigator's filter.
 
@@ -62,7 +85,8 @@ class NavigatorLog:
         self.z, self.h, self.own = np.zeros(m), np.zeros((m, n)), np.ones(m)
         self.seen, self.dx = np.zeros(m, np.bool_), np.zeros(n)
         self._phi, self._qd = np.eye(n), np.zeros((n, n))
-        self._prior = np.zeros((n, n))
+        self._prior, self._unit = np.zeros((n, n)), np.eye(n)
+        self._named, self._at = list[str](), np.zeros(0, np.int64)
 
     def restart(self) -> None:
         """The filter began anew: what was logged says nothing of it."""
@@ -78,10 +102,10 @@ class NavigatorLog:
         qd, unused = np.zeros((n, n)), np.zeros(n)
         noise = spec.accel_psd_m2_s3, spec.clock_f_m2_s, spec.clock_g_m2_s3, spec.isb_psd_m2_s
         kernels.pvt_predict(unused, qd, dt_s, *noise)
-        phi = np.eye(n)
+        phi = self._unit.copy()
         phi[[0, 1, 2, 6], [3, 4, 5, 7]] = dt_s
         eskf_kernels.chain(self._phi, self._qd, phi, qd)
-        self._prior = p.copy()
+        self._prior[:] = p
 
     def slot(self, name: str) -> int:
         """Slot of a satellite, a new one if need be; -1 when all are taken."""
@@ -98,32 +122,19 @@ class NavigatorLog:
         """One update: per satellite ``names``, ``los`` (n, 3), ``second``; ranges, then rates: the innovations (2n,), the
         variances that the filter took, its own without remedies, whether it took the row; ``dx`` the whole correction.
         """
-        m, s, n = 2 * self.slots, self.slots, len(names)
-        at = np.array([self.slot(name) for name in names], dtype=int)
-        known = at >= 0
-        i = self.count % self.length
-        log = self._ring
-        for array in (self.z, self.h, self.seen):
-            array[:] = 0
-        self.own[:] = 1.0
-        var, took = np.ones(m), np.zeros(m, np.bool_)
-        for part in range(2):
-            rows, mine = at[known] + part * s, slice(part * n, (part + 1) * n)
-            self.z[rows], self.own[rows] = innovation[mine][known], own[mine][known]
-            var[rows], took[rows], self.seen[rows] = variance[mine][known], used[mine][known] > 0, True
-            self.h[rows, 3 * part : 3 * part + 3] = -los[known]
-            self.h[rows, 6 + part] = 1.0
-            if part == 0:
-                self.h[rows, 8] = second[known]
-        log.t_s[i], log.phi[i], log.qd[i], log.p[i] = t_s, self._phi, self._qd, self._prior
-        log.r[i], log.var[i], log.used[i] = np.where(took, self.z, 0.0), var, took
-        log.h[i] = np.where(took[:, None], self.h, 0.0)
-        eskf_kernels.innovation_covariance(self._prior, log.h[i], var, took, log.s[i])
-        unused = np.zeros_like(dx)
-        eskf_kernels.update(self._prior.copy(), log.h[i], var, took, log.r[i], log.k[i], unused)
+        if names != self._named:
+            self._named, self._at = list(names), np.array([self.slot(name) for name in names], dtype=np.int64)
+        log = self._views[self.count % self.length]
+        log.t_s[...], log.phi[:], log.qd[:], log.p[:] = t_s, self._phi, self._qd, self._prior
+        record(
+            self._at, los, second, innovation, variance, own, used, self.z, self.h, self.own, self.seen, log.r, log.h, log.var,
+            log.used,
+        )  # fmt: skip
+        eskf_kernels.innovation_covariance(self._prior, log.h, log.var, log.used, log.s)
+        eskf_kernels.update(self._prior, log.h, log.var, log.used, log.r, log.k, np.empty_like(dx))
         self.dx = dx
         self.count += 1
-        self._phi[:], self._qd[:] = np.eye(dx.size), 0.0
+        self._phi[:], self._qd[:] = self._unit, 0.0
 
     def last(self) -> EpochLog:
         """The last epoch (views)."""

@@ -6,6 +6,8 @@ are alike, rho = W_ij / sqrt(W_ii W_jj), explain a fault almost equally well: wh
 """
 
 import math
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -28,13 +30,43 @@ ODDS = 99.0
 """A satellite is no rival once its own fault would be this much less likely."""
 
 
+@dataclass(eq=False)
+class Ranges:
+    """Ranges of one epoch: residuals (m,) without corrections, H (m, 5), variances (m,)."""
+
+    names: list[str]
+    raw: np.ndarray
+    h: np.ndarray
+    var: np.ndarray
+
+    @cached_property
+    def _score(self) -> np.ndarray:
+        try:
+            w, _ = parity_weight(self.h, self.var)
+        except ValueError:
+            return np.zeros((2, len(self.names)))
+        return np.array([w @ self.raw, np.diag(w)])
+
+    def score(self, names: list[str]) -> np.ndarray:
+        """(W r, diagonal of W) of satellites ``names``; zero where the parity says nothing."""
+        if names == self.names:
+            return self._score
+        at = [self.names.index(n) if n in self.names else -1 for n in names]
+        return np.column_stack([self._score, np.zeros(2)])[:, at]
+
+
+def _since(x: np.ndarray) -> np.ndarray:
+    """Sums over the epochs (rows) from each to the last."""
+    return np.cumsum(x[::-1], axis=0)[::-1]
+
+
 class RangeMonitors:
     """Run of the range monitors of an IntegritySpec; ``alarms`` by monitor, ``response`` what they may tell."""
 
     def __init__(self, spec, response: Response, alarms: dict[str, Alarms]) -> None:
         self.spec, self.response, self.alarms = spec, response, alarms
         self._bank: BiasTracker | None = None if spec.bias_bank is None else BiasTracker(spec.bias_bank)
-        self._past: list[tuple[list[str], np.ndarray, np.ndarray, np.ndarray]] = []
+        self._past: list[Ranges] = []
         largest = 0.0 if spec.bias_bank is None else max(map(abs, spec.bias_bank.grid_m))
         self._removal = BiasRemoval(largest, MEMORY)
         self._faulty: str | None = None
@@ -51,8 +83,9 @@ class RangeMonitors:
         """One epoch; rows into ``out``."""
         var = self.response.variance(snap.names, snap.own_m2)
         shift = self.response.shifts(snap.names)
-        h = np.column_stack([-snap.los, np.ones(len(snap.names)), snap.second])
-        self._past.append((snap.names, snap.residual_m + shift, h, var))
+        h = np.empty((len(snap.names), 5))
+        h[:, :3], h[:, 3], h[:, 4] = -snap.los, 1.0, snap.second
+        self._past.append(Ranges(snap.names, snap.residual_m + shift, h, var))
         del self._past[:-RECENT]
         self._raim(snap, h, var, sample, t_s, out)
         self._biases(snap.names, snap.residual_m + shift, h, var, sample, t_s, out)
@@ -95,36 +128,21 @@ class RangeMonitors:
 
     # -- who it is ----------------------------------------------------------------------------------------------------
 
-    def _scores(self, epochs: int) -> list[tuple[list[str], np.ndarray, np.ndarray]]:
-        """(names, W r, diagonal of W) of the last epochs; zero where the parity says nothing."""
-        out = []
-        for names, raw, h, var in self._past[-epochs:]:
-            try:
-                w, _ = parity_weight(h, var)
-                out.append((names, w @ raw, np.diag(w)))
-            except ValueError:
-                out.append((names, np.zeros(len(names)), np.zeros(len(names))))
-        return out
-
     def rivals(self, name: str) -> list[str]:
         """Satellites whose own fault would explain the last epochs nearly as well as a fault of ``name``.
 
         Fault of satellite i with shape s_k and size free: 2 ln L = (sum s_k (W r)_i)^2 / sum s_k^2 W_ii; the larger of a
-        bias and a ramp since the epoch that suits it best, at every fourth epoch of the memory.
+        bias and a ramp since the epoch that suits it best, at every fourth epoch of the memory. Sums since every epoch are
+        sums from the end, of ramps sums of sums, and j^2 = 2 j (j + 1) / 2 - j.
         """
-        names = self._past[-1][0]
+        names = self._past[-1].names
         if name not in names:
             return []
-        scores = self._scores(RECENT)
-        wr, w = np.zeros((2, len(scores), len(names)))
-        for k, (then, a, b) in enumerate(scores):
-            at = [then.index(n) if n in then else -1 for n in names]
-            wr[k], w[k] = np.append(a, 0.0)[at], np.append(b, 0.0)[at]
+        wr, w = (_since(x) for x in np.stack([e.score(names) for e in self._past[-RECENT:]], axis=1))
+        ramp, first = _since(w), slice(None, None, 4)
         best = np.zeros(len(names))
-        for first in range(0, len(scores), 4):
-            for shape in (np.ones(len(wr) - first), np.arange(1.0, len(wr) - first + 1)):
-                size = np.maximum(shape**2 @ w[first:], 1e-12)
-                best = np.maximum(best, (shape @ wr[first:]) ** 2 / size)
+        for score, size in ((wr, w), (_since(wr), 2.0 * _since(ramp) - ramp)):
+            best = np.maximum(best, (score[first] ** 2 / np.maximum(size[first], 1e-12)).max(axis=0))
         close = best > best[names.index(name)] - 2.0 * math.log(ODDS)
         return [n for n, c in zip(names, close) if c and n != name]
 
@@ -197,10 +215,7 @@ class BiasTracker:
         """One epoch of satellites ``names``; see ``BiasBankRun``."""
         if names != self._heard:
             self._seat(names)
-        at, m = self._at, len(self.names)
-        r, hh, v, take = np.zeros(m), np.zeros((m, h.shape[1])), np.ones(m), np.zeros(m, bool)
-        r[at], hh[at], v[at], take[at] = raw, h, var, used
-        return self.run(r, hh, v, take)
+        return self.run.ranges(self._at, raw, h, var, used)
 
     def _seat(self, names) -> None:
         """A place in the bank for every satellite that has none, and the place of each of ``names``."""
@@ -227,4 +242,6 @@ class BiasTracker:
 
     def correction(self, report: BiasReport) -> dict[str, float]:
         """Declared biases by name."""
+        if not report.declared:
+            return {}
         return {n: float(b) for n, b in zip(self.names, self.run.correction_m(report)) if b}

@@ -177,7 +177,9 @@ def test_redundant_measurements_tell_the_noise_of_a_first_order_loop():
     epochs["state"], epochs["code_error_chips"], epochs["cn0_dbhz"] = STATE_LOCKED, error, 60.0
     spec = ReceiverSpec(tracking={"l1ca": {"dll_bw_hz": bt_hz}})
     for part in np.array_split(epochs, 3):
-        run.hear({("L1CA", 1): 2}, np.tile(part, (4, 1)), np.array([0, len(part), len(part), 0]), spec.tracking)
+        run.hear(
+            {("L1CA", 1): 2}, np.tile(part, (4, 1)), np.array([0, len(part), len(part), 0]), spec.tracking
+        )
     got = run._noise.estimate()["G01"] / METRES_PER_CHIP**2
     # Relative standard error of both mean squares below sqrt(2/n) times a correlation factor of 2.
     assert abs(got / x.var() - 1) < Z * 2 * np.sqrt(2 / n)
