@@ -234,6 +234,20 @@ def test_rivals_are_those_of_the_likelihoods_written_out():
     assert ranges.rivals("G02") == want and 0 < len(want) < 7
 
 
+def test_parallel_filters_name_whom_they_may_mean():
+    """Every alarm carries the satellites that the range monitors find as likely."""
+    fault = lambda t: one(1, 0.6 * max(t - 10.0, 0.0))  # noqa: E731
+    _, run, rows, _ = fly(
+        {"parallel_filters": ALL["parallel_filters"], "bank_every": 5}, seconds=45.0, fault=fault
+    )
+    high = rows["parallel_filters"][rows["parallel_filters"]["value"] >= 90.0]
+    assert len(high) and np.all(high["prn"] == 2)
+    run._ranges.rivals = lambda name: ["E01", "G07"]
+    more = high[-1:].copy()
+    run._name_rivals(more)
+    assert more["rivals"][0] == b"E01 G07"
+
+
 # ------------------------------------------------------------------------------------------------------- on IF samples
 
 
