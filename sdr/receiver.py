@@ -190,6 +190,8 @@ class Receiver:
         samples = samples[:, : self._wanted]
         self._recent.clear()
         self._next_retry = n_end + round(RETRY_S * self.fs_hz)
+        if not samples.any():  # padding: the search waits for samples
+            return np.empty(0, ACQUISITION)
         return self._acquire(first, samples, self._due(n_end))
 
     def _drop_lost(self) -> None:
@@ -235,7 +237,7 @@ class Receiver:
         found = []
         for signal in dict.fromkeys(s for s, _ in due):
             prns = [p for s, p in due if s == signal]
-            if samples.shape[1] < 2 * SIGNALS[signal].code_period_s * self.fs_hz or not samples.any():
+            if samples.shape[1] < 2 * SIGNALS[signal].code_period_s * self.fs_hz:
                 continue
             self.searched[signal] = sorted({*self.searched.get(signal, ()), *prns})
             rows = acquire(

@@ -244,6 +244,17 @@ def test_a_signal_without_noise_is_found():
     assert abs(apart(found["code_phase_chips"][0], 5.5, 1023)) < 0.1
 
 
+@pytest.mark.parametrize("zeros", [slice(0, 200_000), slice(60_000, None), slice(1, None), slice(None, -1)])
+def test_padding_is_no_signal_and_no_crash(zeros):
+    fs_hz, rng = 4.096e6, np.random.default_rng(23)
+    n = slab_samples("L1CA", fs_hz)
+    iq = slab([satellite("L1CA", 7, fs_hz, n, -810.0, 640.0, 47.0, rng)], n, rng, np.int8)
+    iq[:, zeros] = 0
+    with np.errstate(all="raise"):
+        found = acquire(iq, 0, fs_hz, 0.0, "L1CA", range(6, 9))
+    assert not found["acquired"][[0, 2]].any()
+
+
 def test_threads_do_not_change_a_bit():
     fs_hz, rng = 4.096e6, np.random.default_rng(19)
     n = slab_samples("L1CA", fs_hz)

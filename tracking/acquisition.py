@@ -293,6 +293,9 @@ def _search(spectra, templates, plan):
                 run()
                 kernels.add_power(result, moved, acc)
         peak, lag[i], mean, spread = kernels.row_peak(acc, guard)
+        if mean <= 0.0:  # zeros
+            statistic[i] = 0.0
+            continue
         excess = spread / mean * math.sqrt(terms)
         statistic[i] = 1 + (peak / mean - 1) / (excess if excess > widest else 1.0)
     return _Rows(statistic, lag), terms
@@ -450,9 +453,14 @@ def _verify(follower, rows, p_fa):
             pieces = follower.pieces(plan.doppler_hz[i], rows.lag[i], offset)
             power, count = _window_power(pieces, periods, residual_hz, periods)
             k = int(np.argmax(power))
-            rough = power[k] / np.sum(np.abs(pieces[:, : count * periods // len(pieces)]) ** 2)
-            best = max(best, (float(rough), i, float(power[k]) / count, float(residual_hz[k]), count))
+            total = np.sum(np.abs(pieces[:, : count * periods // len(pieces)]) ** 2)
+            if total > 0:
+                best = max(
+                    best, (float(power[k] / total), i, float(power[k]) / count, float(residual_hz[k]), count)
+                )
     rough, i, power, residual, count = best
+    if count == 0:  # the later samples are zeros
+        return None
     cells = len(order) * len(offsets) * len(residual_hz)
     threshold = _fresh_threshold(p_fa, cells, count)
     if rough < 0.7 * threshold:
