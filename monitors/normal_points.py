@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 
 from nav import eskf_kernels
-from nav.eskf import EpochLog, empty_log
+from nav.eskf import EpochLog, empty_log, epochs_of, newest
 from nav.navlog import EXCLUDED_M2
 
 
@@ -43,6 +43,22 @@ def gather(phi, qd, h, z, own, dx, gain, total_phi, total_qd, moved, row, mean, 
         moved[j] += dx[j]
 
 
+@njit(cache=True, nogil=True)
+def divide(kept, count, info, mean, row, scale, z, h, own, seen, single, r_used, h_used, var, used):
+    """A window's sums into normal points, by row, and into the log's; ``kept`` (S,): the slot has had one satellite only."""
+    slots = kept.size
+    for i in range(2 * slots):
+        seen[i] = count[i] > 0 and kept[i % slots]
+        used[i] = seen[i] and scale[i] < EXCLUDED_M2
+        own[i] = 1.0 / info[i] if seen[i] else 1.0
+        z[i] = mean[i] / info[i] if seen[i] else 0.0
+        single[i] = count[i] / info[i] if seen[i] else np.nan
+        var[i], r_used[i] = own[i] * scale[i], z[i] if used[i] else 0.0
+        for j in range(row.shape[1]):
+            h[i, j] = row[i, j] if seen[i] else 0.0
+            h_used[i, j] = row[i, j] if used[i] else 0.0
+
+
 class NormalPoints:
     """Log of a steering filter with the face of ``nav.navlog.NavigatorLog``: ``add`` every epoch, ``close`` a window.
 
@@ -59,7 +75,7 @@ class NormalPoints:
         self._gain = np.repeat(np.array([clock, drift]), slots)
         self.epochs, self.single = 0, np.full(m, np.nan)
         self._ring = empty_log(length, n, m)
-        self._views = [EpochLog(*(array[i, ...] for array in self._ring)) for i in range(length)]
+        self._views = epochs_of(self._ring)
         self._start: np.ndarray | None = None
         self._open()
 
@@ -83,30 +99,20 @@ class NormalPoints:
         """
         first, self._start = self._start, p.copy()
         # A slot that changed hands within the window holds two satellites' ranges.
-        kept = np.tile([a == b for a, b in zip(names, self.names)], 2)
-        seen = (self._n > 0) & kept
-        info = np.where(seen, self._info, 1.0)
-        self.names, self.seen, self.epochs = list(names), seen, int(max(self._n.max(), 1))
-        self.z, self.own = np.where(seen, self._mean / info, 0.0), 1.0 / info
-        self.h, self.dx = np.where(seen[:, None], self._row, 0.0), self._moved
-        self.single = np.where(seen, self._n / info, np.nan)
-        phi, qd = self._phi, self._qd
+        kept = np.array([a == b for a, b in zip(names, self.names)])
+        log = self._views[self.count % self.length]
+        divide(
+            kept, self._n, self._info, self._mean, self._row, scale, self.z, self.h, self.own, self.seen, self.single, log.r,
+            log.h, log.var, log.used,
+        )  # fmt: skip
+        self.names, self.epochs, self.dx = list(names), int(max(self._n.max(), 1)), self._moved
+        if first is not None:
+            eskf_kernels.predict(first, self._phi, self._qd)
+            log.t_s[...], log.phi[:], log.qd[:], log.p[:] = t_s, self._phi, self._qd, first
+            eskf_kernels.update(first, log.h, log.var, log.used, log.r, log.k, np.empty_like(self.dx))
+            self.count += 1
         self._open()
-        if first is None:
-            return False
-        self._store(t_s, phi, qd, scale, first)
-        return True
-
-    def _store(self, t_s, phi, qd, scale, p) -> None:
-        log, i = self._ring, self.count % self.length
-        eskf_kernels.predict(p, phi, qd)
-        used = self.seen & (scale < EXCLUDED_M2)
-        log.t_s[i], log.phi[i], log.qd[i], log.p[i], log.used[i] = t_s, phi, qd, p, used
-        log.var[i], log.r[i] = self.own * scale, np.where(used, self.z, 0.0)
-        log.h[i] = np.where(used[:, None], self.h, 0.0)
-        after, unused = p.copy(), np.zeros_like(self.dx)
-        eskf_kernels.update(after, log.h[i], log.var[i], used, log.r[i], log.k[i], unused)
-        self.count += 1
+        return first is not None
 
     def restart(self, p: np.ndarray) -> None:
         """Forget the epochs: the filter has another covariance, ``p``, from now on."""
@@ -119,11 +125,4 @@ class NormalPoints:
 
     def log(self, n_epochs: int | None = None) -> EpochLog:
         """The last ``n_epochs`` normal points, oldest first (copies, ``s`` left empty)."""
-        have = min(self.count, self.length)
-        want = have if n_epochs is None else n_epochs
-        if want > have:
-            raise ValueError(
-                f"the log holds {have} epochs, {want} were asked for: wait or shorten the window"
-            )
-        index = np.arange(self.count - want, self.count) % self.length
-        return EpochLog(*(array[index] for array in self._ring))
+        return newest(self._ring, self.count, n_epochs)

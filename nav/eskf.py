@@ -51,6 +51,25 @@ def empty_log(n_epochs: int, n: int, m: int) -> EpochLog:
     return EpochLog(t_s=np.zeros(n_epochs), used=np.zeros((n_epochs, m), dtype=np.bool_), **arrays)
 
 
+def epochs_of(ring: EpochLog) -> list[EpochLog]:
+    """Views of every row of a ring."""
+    return [EpochLog(*(array[i, ...] for array in ring)) for i in range(ring.n_epochs)]
+
+
+def newest(ring: EpochLog, count: int, n_epochs: int | None = None, held: int | None = None) -> EpochLog:
+    """The last ``n_epochs`` epochs of a ring, oldest first (copies).
+
+    ``count``: epochs written so far, row k holding epoch k modulo the ring's length; ``held``: the last of them that still count.
+    Raises ValueError when more are asked for than there are.
+    """
+    have = min(count if held is None else held, ring.n_epochs)
+    want = have if n_epochs is None else n_epochs
+    if want > have:
+        raise ValueError(f"the log holds {have} epochs, {want} were asked for: wait or shorten the window")
+    index = np.arange(count - want, count) % ring.n_epochs
+    return EpochLog(*(array[index] for array in ring))
+
+
 def discretise(f: np.ndarray, q_diag: np.ndarray, dt_s: float) -> tuple[np.ndarray, np.ndarray]:
     """(Phi, Qd) of one step; see ``eskf_kernels.discretise``."""
     phi, qd = np.empty_like(f), np.empty_like(f)
@@ -171,14 +190,7 @@ class Eskf:
 
     def log(self, n_epochs: int | None = None) -> EpochLog:
         """The last ``n_epochs`` epochs, oldest first (copies)."""
-        have = self.n_logged
-        want = have if n_epochs is None else n_epochs
-        if want > have:
-            raise ValueError(
-                f"The epoch log holds {have} epochs, {want} were asked for: wait or shorten the window."
-            )
-        index = np.arange(self._count - want, self._count) % self._ring.t_s.size
-        return EpochLog(*(array[index] for array in self._ring))
+        return newest(self._ring, self._count, n_epochs)
 
 
 def nis(log: EpochLog) -> tuple[np.ndarray, np.ndarray]:

@@ -26,7 +26,6 @@ import numpy as np
 from numba import njit
 from pydantic import BaseModel, ConfigDict, Field
 
-from nav.eskf_kernels import discretise, predict
 from nav.frames import (
     earth_radii,
     ecef_from_geodetic,
@@ -235,31 +234,6 @@ def riss_sf_f(x, scale_rate, gyro_rate, pitch_rate, f):
     f[7, 8] = 1.0
 
 
-@njit(cache=True, nogil=True)
-def riss_epoch(x, form, p, wz, fy, fx, speed, dt_s, filter_s, rates, q_diag, phi, qd):
-    """Predict over one navigation epoch of m sensor intervals: nominal state and P in place.
-
-    Parameters
-    ----------
-    x (19,), form : nominal state;  p (n, n) : covariance of the form's error states
-    wz, fy, fx, speed (m,) : sensors (``riss_step``);  dt_s : one interval
-    rates : 1/tau, (accel, gyro) for PAPER, (scale, gyro, pitch) for SCALE;  q_diag (n,)
-    phi, qd (n, n) : out, the epoch's transition and noise (one step of m dt_s)
-    """
-    m = wz.size
-    turn = 0.0
-    for k in range(m):
-        riss_step(x, form, wz[k], fy[k], fx[k], speed[k], dt_s, filter_s)
-        turn += wz[k] / m
-    f = np.empty(p.shape)
-    if form == SCALE:
-        riss_sf_f(x, rates[0], rates[1], rates[2], f)
-    else:
-        riss11_f(x, turn, rates[0], rates[1], f)
-    discretise(f, q_diag, m * dt_s, phi, qd)
-    predict(p, phi, qd)
-
-
 class _Riss(BaseModel):
     """What both forms share."""
 
@@ -289,22 +263,12 @@ class _Riss(BaseModel):
 
     @property
     def rates_per_s(self) -> np.ndarray:
-        """1/tau of the model's Gauss-Markov states, for ``riss_epoch``."""
+        """1/tau of the model's Gauss-Markov states."""
         raise NotImplementedError
 
     def q_diag(self, x):
         """Diagonal of Qc (n,)."""
         raise NotImplementedError
-
-    def epoch(self, x, p, wz, fy, fx, speed_mps, dt_s):
-        """Predict state x and covariance p in place over m sensor intervals; returns (Phi, Qd) of the
-        epoch."""
-        phi, qd = np.empty_like(p), np.empty_like(p)
-        riss_epoch(
-            x, self.form_code, p, wz, fy, fx, speed_mps, dt_s, self.pitch_filter_s, self.rates_per_s,
-            self.q_diag(x), phi, qd,
-        )  # fmt: skip
-        return phi, qd
 
     def inject(self, x, dx):
         """Nominal state corrected by dx = true - estimate (a new array)."""

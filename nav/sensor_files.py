@@ -155,3 +155,58 @@ def check_times(t_s, duration_s, what):
         raise ValueError(f"{what} begin at {t_s[0]:.6g} s, after the first sample; they must cover it.")
     if duration_s is not None and t_s[-1] < duration_s - 1.5 * usual:
         raise ValueError(f"{what} end at {t_s[-1]:.6g} s, before the samples do ({duration_s:.6g} s).")
+
+
+BLOCK_S, EXCITED_MPS2, SURE = 1.0, 0.15, 0.1
+"""Accelerations are compared as means over this long; moves weaker than this tell nothing; nor does a share of the other axis whose
+standard error is larger."""
+
+
+def check_axes(force_mps2, turn_rad_s, speed_mps, dt_s):
+    """Whether the accelerometer's x and y are forward and right, by the odometer and the turn rate about down.
+
+    On level ground f_x = dv/dt and f_y = v w. Each of the two that the drive excites is looked for in both axes by least
+    squares: c = cov(move, axis) / var(move), 1 in its own and 0 in the other.
+
+    Parameters
+    ----------
+    force_mps2 (m, 2) : x, y;  turn_rad_s, speed_mps (m,);  dt_s : between rows
+
+    Returns
+    -------
+    str : "as they should be", "not observable" (no move strong enough) or "not confirmed" (a move that no axis shows, as in
+    banked turns).
+
+    Raises
+    ------
+    ValueError
+        The axes are exchanged, or one points the other way.
+    """
+    per = max(1, round(BLOCK_S / dt_s))
+    blocks = lambda a: a[: len(a) // per * per].reshape(-1, per, *a.shape[1:]).mean(axis=1)  # noqa: E731
+    force, speed = blocks(np.asarray(force_mps2)), blocks(np.asarray(speed_mps))
+    if len(speed) < 10:
+        return "not observable"
+    moves = np.gradient(speed, per * dt_s), blocks(np.asarray(speed_mps) * turn_rad_s)
+    said = "not observable"
+    for k, (move, name) in enumerate(zip(moves, ("speeding up", "turning"))):
+        excited = move - move.mean()
+        energy = float(excited @ excited)
+        share = excited @ (force - force.mean(axis=0)) / max(energy, 1e-30)
+        rest = force - force.mean(axis=0) - np.outer(excited, share)
+        error = np.sqrt((rest**2).mean(axis=0) / max(energy, 1e-30))
+        if move.std() < EXCITED_MPS2 or error.max() > SURE:
+            continue
+        own, other = share[k], share[1 - k]
+        axis, wanted = "xy"[k], ("forward", "right")[k]
+        if abs(own) < 0.5 < abs(other):
+            raise ValueError(
+                f"what the odometer says of {name} stands in accel_{'yx'[k]} ({other:.2f} of it) and not in accel_{axis} "
+                f"({own:.2f}): x and y are exchanged; the axes must be forward, right, down."
+            )
+        if own < -0.5:
+            raise ValueError(
+                f"accel_{axis} says the opposite of what the odometer says of {name} ({own:.2f} of it): it must point {wanted}."
+            )
+        said = "not confirmed" if own < 0.5 or said == "not confirmed" else "as they should be"
+    return said

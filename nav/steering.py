@@ -6,6 +6,7 @@ the next scalar fix starts it anew. Nothing diverges silently.
 """
 
 import math
+from bisect import bisect_right
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +19,7 @@ from nav.measurements import WEEK_MS
 from nav.navlog import Remedy
 from nav.records import SATELLITE, SOLUTION, STEERING
 from nav.riss import speed_at
+from nav.sensor_files import check_axes
 from nav.ultratight import (
     COASTING,
     LOST,
@@ -32,6 +34,7 @@ from nav.ultratight import (
     nominal_of,
     start_covariance,
 )
+from nav.ultratight_kernels import LEFT_OUT
 from signals.constants import C_MPS, METRES_PER_CHIP, SECONDS_PER_WEEK, WAVELENGTH_M
 from signals.orbits import orbit_coefficients
 from signals.records import EPHEMERIS
@@ -44,8 +47,6 @@ MIN_CN0_DBHZ = 30.0
 """A channel is taken over in phase lock at this C/N0 at the least."""
 ISB_SIGMA_M = 5.0
 """Of an inter-system bias that a scalar fix gave."""
-LEFT_OUT = 1e12
-"""Factor on the variances of a satellite that a monitor excludes: it weighs nothing and is still steered."""
 REPORT_S = 0.1
 """Between new values of the slower columns of ``Steering.record``."""
 REFRESH_S = 1.0
@@ -111,7 +112,9 @@ class Steering:
             *((sensors.imu_spec, sensors.odometer_spec, sensors.barometer_spec) if sensors else ()),
         )
         self.per_epoch, self.dt_s = 1, 1.0 / spec.update_hz
-        self._table, self._sensor_sample = np.zeros((0, kernels.N_SENSOR)), np.zeros(0, np.int64)
+        self._table = np.zeros((0, kernels.N_SENSOR))
+        self._sensor_sample: list[int] = []
+        self.axes = "not observable"
         if spec.mode == "ultra_tight":
             self._read_sensors()
         self._tables = np.stack(
@@ -127,7 +130,7 @@ class Steering:
         self.state, self.reason, self.filter = SCALAR, "waiting for a scalar fix", None
         self.record = np.zeros(1, STEERING)
         self.sample = -1
-        self._fix_since = self._coast_since = -1
+        self._fix_since = -1
         self._seconds, self._released = {STEERED: 0.0, COASTING: 0.0}, ""
         self._began_s: float | None = None
         self._n_released, self._estimate_isb, self._reference = 0, False, "G"
@@ -157,7 +160,9 @@ class Steering:
             )
         self.per_epoch, self.dt_s = round(per), 1.0 / rate
         self._table = self.sensors.table()
-        self._sensor_sample = self.sensors.imu["sample_index"].astype(np.int64)
+        self._sensor_sample = self.sensors.imu["sample_index"].tolist()
+        if self.sensors.odometer is not None:
+            self.axes = check_axes(self._table[:, 3:5], self._table[:, 2], self._table[:, 6], self.dt_s)
 
     # -- start and end ------------------------------------------------------------------------------------------
 
@@ -186,7 +191,6 @@ class Steering:
         self.meet(isb_m)
         self._clock, self._klobuchar = clock, klobuchar
         self.sample = sample
-        self._predict_only(sample)
         self.take(channels, ephemerides)
         self.refresh(ephemerides)
         if int(self.active.sum()) < self.spec.min_satellites:
@@ -194,7 +198,7 @@ class Steering:
             self.filter = None
             self._slots()
             return False
-        self.state, self.reason, self._coast_since = STEERED, "", -1
+        self.state, self.reason = STEERED, ""
         if self._began_s is None:
             self._began_s = sample / self.fs_hz
         return True
@@ -204,10 +208,8 @@ class Steering:
         azimuth = None if self.spec.heading_deg is None else math.radians(self.spec.heading_deg)
         speed = None
         if self._table.size:
-            row = min(
-                int(np.searchsorted(self._sensor_sample, sample, side="right")) - 1, len(self._table) - 1
-            )
-            speed = float(self._table[max(row, 0), 6])
+            row = max(bisect_right(self._sensor_sample, sample) - 1, 0)
+            speed = float(self._table[row, 6])
         moving = float(np.linalg.norm(vel))
         has_odometer = self.sensors is not None and self.sensors.odometer is not None
         if speed is not None and has_odometer and abs(speed - moving) > 1.0 + 0.2 * moving:
@@ -240,7 +242,7 @@ class Steering:
     def release(self, reason: str) -> np.ndarray:
         """Let all channels go."""
         self.state, self.reason, self.filter = LOST, reason, None
-        self._fix_since, self._coast_since = -1, -1
+        self._fix_since = -1
         self._n_released += 1
         self._released = f"{self.sample / self.fs_hz:.1f} s: {reason}"
         self._slots()
@@ -368,8 +370,9 @@ class Steering:
         ``epochs``, ``counts``: of ``Tracker.process``; ``channels_state`` (C,) STATE_* of the tracker's channels;
         ``ephemerides``: called once a second for the newest EPHEMERIS rows. Returns AIDING (C,).
         """
-        for i in np.flatnonzero(self.active & (channels_state[self.slot] != STATE_LOCKED)):
-            self.drop(int(i))
+        if kernels.any_unlocked(self.active, self.slot, np.ascontiguousarray(channels_state)):
+            for i in np.flatnonzero(self.active & (channels_state[self.slot] != STATE_LOCKED)):
+                self.drop(int(i))
         if sample >= self._next_refresh:
             self.refresh(ephemerides())
         commands = np.zeros(len(channels_state), AIDING)
@@ -395,9 +398,6 @@ class Steering:
             f.rho, f.rate, f.accel, f.los, f.f, log.phi, log.qd, log.h, log.r, log.var, f.own, log.used, log.k, log.s, log.p, f.dx,
             commands,
         )  # fmt: skip
-        # Rows that weigh nothing are no degrees of freedom.
-        if self.inflate.max() >= LEFT_OUT:
-            rows = max(0, rows - int(np.sum((f.own > 0) & (self.inflate >= LEFT_OUT))))
         f.nis, f.n_rows = nis, rows
         self.sample = sample
         return nis, rows, surprise
@@ -406,17 +406,13 @@ class Steering:
         """Sensor rows of the epoch that ends at ``sample``; vector mode has one empty row."""
         if not self._table.size:
             return np.zeros((1, kernels.N_SENSOR))
-        last = int(np.searchsorted(self._sensor_sample, sample + 1, side="right"))
+        last = bisect_right(self._sensor_sample, sample + 1)
         first = last - self.per_epoch
         if first < 0 or sample - self._sensor_sample[last - 1] > 1.5 * self.dt_s * self.fs_hz:
             raise ValueError(
                 f"sensor data do not cover sample {sample}; record them over the whole time of the samples"
             )
         return self._table[first:last]
-
-    def _predict_only(self, sample):
-        """Ranges and unit vectors before the first step."""
-        self.filter.rho[:] = 2.2e7 + self.filter.clock()[0]
 
     def _judge(self, sample, surprise, rows):
         """State from what is seen and how well the next interval is known."""
@@ -429,11 +425,7 @@ class Steering:
         )
         self.sigma, self.usable = sigma, usable
         self._missing_s = self._missing_s + 1.0 / self.spec.update_hz if missing >= heard > 0 else 0.0
-        if usable >= 1:
-            self.state, self._coast_since = STEERED, -1
-        else:
-            self.state = COASTING
-            self._coast_since = sample if self._coast_since < 0 else self._coast_since
+        self.state = STEERED if usable >= 1 else COASTING
         why = ""
         if not (math.isfinite(sigma[0]) and math.isfinite(sigma[1])):
             why = "the filter's state is not finite"
@@ -448,7 +440,6 @@ class Steering:
         elif usable >= self.spec.min_satellites and self._ratio > INCONSISTENT_RATIO:
             why = f"innovations are {self._ratio:.1f} times what the filter expects"
         if why:
-            self._sigma_2d = math.inf
             self.release(why)
 
     def due(self, every_s: float) -> bool:
@@ -456,25 +447,28 @@ class Steering:
         return self.filter.epochs % max(1, round(every_s * self.spec.update_hz)) == 0
 
     def summary(self) -> dict[str, Any]:
-        """How it went: from when on, for how long with and without satellites, how often it let go and why the last time."""
+        """How it went: from when on, for how long with and without satellites, how often it let go and why the last time.
+
+        ``axes``: what the odometer says of the IMU's, see ``sensor_files.check_axes``.
+        """
         return {
             "mode": self.spec.mode, "model": self.model.kind, "first_s": self._began_s,
             "steered_s": self._seconds[STEERED], "coasting_s": self._seconds[COASTING], "released": self._n_released,
-            "reason": self._released or self.reason,
+            "reason": self._released or self.reason, "axes": self.axes,
         }  # fmt: skip
 
     def _report(self, sample, nis, rows):
         r = self.record[0]
         if self.state != LOST:
             self._seconds[self.state] += 1.0 / self.spec.update_hz
-        r["sample_index"], r["t_s"], r["state"] = sample, sample / self.fs_hz, self.state
-        r["nis"], r["rows"] = nis, rows
-        r["sigma_range_m"], r["sigma_rate_mps"] = self.sigma
-        r["n_steered"], r["n_used"] = int(self.active.sum()), self.usable
         if self.filter is not None and self.due(REPORT_S):
             f, cn0 = self.filter, np.sort(self.filter.cn0[self.active])
             r["sigma_2d_m"] = kernels.horizontal_sigma(f.code, f.x, f.p)
             r["cn0_median_dbhz"] = 10.0 * math.log10(max(float(cn0[cn0.size // 2]), 1.0)) if cn0.size else 0.0
+        self.record[0] = (
+            sample, sample / self.fs_hz, self.state, np.count_nonzero(self.active), self.usable, nis, rows,
+            r["sigma_2d_m"], self.sigma[0], self.sigma[1], r["cn0_median_dbhz"],
+        )  # fmt: skip
 
     def solution(self, week: int) -> np.ndarray:
         """SOLUTION row of the last epoch; valid while the filter steers with satellites or coasts within 50 m."""

@@ -10,8 +10,6 @@ import math
 import numpy as np
 from numba import njit
 
-from nav.errormodels import ecef17_f
-from nav.eskf_kernels import discretise, predict
 from nav.frames import gravity_ecef, rotation_body_to_ned, rotation_ned_to_ecef
 from signals.constants import EARTH_RATE_RAD_S
 
@@ -111,39 +109,6 @@ def strapdown(pos, vel, c_be, gyro, accel, dt_s, pos_out, vel_out, c_out):
     for k in range(gyro.shape[0]):
         strapdown_step(pos, vel, c_be, gyro[k], accel[k], dt_s[k])
         pos_out[k], vel_out[k], c_out[k] = pos, vel, c_be
-
-
-@njit(cache=True, nogil=True)
-def ecef17_epoch(pos, vel, c_be, bias, clock, p, gyro, accel, dt_s, rates, q_diag, phi, qd):
-    """Predict the 17-state filter over one navigation epoch of m IMU intervals, in place.
-
-    Parameters
-    ----------
-    pos, vel (3,), c_be (3, 3) : nominal state;  bias (6,) : accelerometer m/s^2, gyro rad/s (measured = true + bias)
-    clock (2,) : bias m, drift m/s;  p (17, 17) : covariance
-    gyro, accel (m, 3) : raw means;  dt_s : one IMU interval
-    rates (2,) : 1/tau of accelerometer and gyro biases, 1/s;  q_diag (17,)
-    phi, qd (17, 17) : out, the epoch's transition and noise (one step of m dt_s with the mean specific force)
-    """
-    m = gyro.shape[0]
-    force, a, g = np.zeros(3), np.empty(3), np.empty(3)
-    middle = np.empty((3, 3))
-    for k in range(m):
-        if k == m // 2:
-            middle[:, :] = c_be
-        for i in range(3):
-            a[i], g[i] = accel[k, i] - bias[i], gyro[k, i] - bias[3 + i]
-            force[i] += a[i] / m
-        strapdown_step(pos, vel, c_be, g, a, dt_s)
-    span = m * dt_s
-    f = np.empty((17, 17))
-    ecef17_f(pos, middle, force, rates[0], rates[1], f)
-    discretise(f, q_diag, span, phi, qd)
-    predict(p, phi, qd)
-    for i in range(3):
-        bias[i] *= math.exp(-rates[0] * span)
-        bias[3 + i] *= math.exp(-rates[1] * span)
-    clock[0] += clock[1] * span
 
 
 def mechanise(pos_ecef_m, vel_ecef_mps, c_be, imu, start_s):

@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from nav import ultratight_kernels as kernels
-from nav.eskf import EpochLog, empty_log
+from nav.eskf import EpochLog, empty_log, epochs_of, newest
 from nav.frames import earth_radii
 from nav.imu import BarometerSpec, ecef17_of, pinson13_of
 from nav.riss import DEG_H, HEIGHT, LAT, Riss11, RissSf, riss_nominal
@@ -314,7 +314,7 @@ class Filter:
         self.own, self.extra = np.zeros(m), None
         self.nis, self.n_rows, self.epochs, self._first = math.nan, 0, 0, 0
         self._ring = empty_log(log_length, n, m)
-        self._views = [EpochLog(*(array[i, ...] for array in self._ring)) for i in range(log_length)]
+        self._views = epochs_of(self._ring)
 
     def slot(self, t_s: float) -> EpochLog:
         """Views of the log's next row, of time ``t_s``."""
@@ -325,14 +325,7 @@ class Filter:
 
     def log(self, n_epochs: int | None = None) -> EpochLog:
         """The last ``n_epochs`` epochs, oldest first (copies)."""
-        have = min(self.epochs - self._first, self._ring.t_s.size)
-        want = have if n_epochs is None else n_epochs
-        if want > have:
-            raise ValueError(
-                f"the log holds {have} epochs, {want} were asked for: wait or shorten the window"
-            )
-        index = np.arange(self.epochs - want, self.epochs) % self._ring.t_s.size
-        return EpochLog(*(array[index] for array in self._ring))
+        return newest(self._ring, self.epochs, n_epochs, self.epochs - self._first)
 
     def last(self) -> EpochLog:
         """The last epoch (views)."""

@@ -55,6 +55,8 @@ about up, from east and north (rad), and the last height read (m, NaN: none)."""
 N_X, ACC, ISB = 32, 27, 30
 """Length of the nominal state; ECEF acceleration (3) of the last prediction; inter-system bias, m."""
 
+LEFT_OUT = 1e12
+"""Factor on the variances of a satellite that a monitor excludes: it weighs nothing and is still steered."""
 N_CN0 = 15
 """Columns of what is kept of a channel: prompt power fast and slow, noise power fast, time watched, mean of squared range
 innovations, C/N0 (Hz), signal power remembered from when it was strong; smoothed range and rate, measured minus predicted
@@ -696,8 +698,8 @@ def navigation_epoch(model, x, p, sensors, dt_s, every_s, epoch, block, filter_s
     """Predict, update from every channel's discriminators and steer: one call per navigation epoch.
 
     The epoch ends at receiver ``sample``; commands hold from there on. ``inflate`` (2C,) multiplies the variances of ranges
-    and rates, ``own`` (2C,) receives them without it, 0 where nothing was heard. Returns (NIS, rows, mean over the rows taken of their
-    normalised innovations squared, none above ``SURPRISE``).
+    and rates, ``own`` (2C,) receives them without it, 0 where nothing was heard. Returns (NIS, rows that weigh something, mean over
+    the rows taken of their normalised innovations squared, none above ``SURPRISE``).
     """
     n, count = p.shape[0], active.size
     sat_pos, sat_vel, sat_acc = np.empty((count, 3)), np.empty((count, 3)), np.empty((count, 3))
@@ -743,7 +745,18 @@ def navigation_epoch(model, x, p, sensors, dt_s, every_s, epoch, block, filter_s
         if used[r]:
             surprise += min(z[r] * z[r] / s[r, r], SURPRISE)
             n_used += 1
-    return nis, n_rows, surprise / max(n_used, 1)
+        if own[r] > 0.0 and inflate[r] >= LEFT_OUT:
+            n_rows -= 1  # no degree of freedom
+    return nis, max(n_rows, 0), surprise / max(n_used, 1)
+
+
+@njit(cache=True, nogil=True)
+def any_unlocked(active, slot, states):
+    """Whether a channel under command is no longer locked; ``states`` (C,) of all the tracker's channels."""
+    for c in range(active.size):
+        if active[c] and states[slot[c]] != STATE_LOCKED:
+            return True
+    return False
 
 
 @njit(cache=True, nogil=True)

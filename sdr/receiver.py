@@ -146,7 +146,8 @@ class Receiver:
         self.position = n_end
         rows = [(c, epochs[c, :n], corr[c, :n]) for c, n in enumerate(counts) if n]
         for c, mine, _ in rows:
-            self.drift.hear(self.tracker.channels["signal"][c].decode(), mine)
+            if len(mine) > 1:
+                self.drift.hear(self.tracker.channels["signal"][c].decode(), mine)
         out = Outcome(n0, n_end, found, rows)
         if self.integrity is not None:
             self.integrity.hear(self.channel_of, epochs, counts, self.spec.tracking)
@@ -189,9 +190,9 @@ class Receiver:
         )
         samples = samples[:, : self._wanted]
         self._recent.clear()
-        self._next_retry = n_end + round(RETRY_S * self.fs_hz)
         if not samples.any():  # padding: the search waits for samples
             return np.empty(0, ACQUISITION)
+        self._next_retry = n_end + round(RETRY_S * self.fs_hz)
         return self._acquire(first, samples, self._due(n_end))
 
     def _drop_lost(self) -> None:
@@ -352,8 +353,8 @@ class Receiver:
     def _commands(self) -> np.ndarray | None:
         """AIDING of the slab that begins: what navigation left at the last one's end, for new channels nothing."""
         heeds = self._adapts and (not self.spec.respond.off or bool(self.flags.names))
-        if self._aiding is None and not heeds:
-            return None
+        if not heeds and (self._aiding is None or len(self._aiding) == len(self.tracker.channels)):
+            return self._aiding
         commands = np.zeros(len(self.tracker.channels), AIDING)
         if self._aiding is not None:
             commands[: len(self._aiding)] = self._aiding

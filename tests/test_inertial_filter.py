@@ -5,11 +5,13 @@ import numpy as np
 import pytest
 from naive_riss import SATELLITES
 
+from nav import ultratight_kernels as kernels
 from nav.errormodels import EcefState, measurement_rows
 from nav.eskf import Eskf, discretise
 from nav.frames import geodetic_from_ecef, rotation_enu_to_ecef
 from nav.imu import DEG_H, MG, ImuSpec, ecef17_of, simulate_imu, true_attitude
-from nav.strapdown import ecef17_epoch, strapdown_step
+from nav.strapdown import strapdown_step
+from nav.ultratight import extended_q, model_rates
 from signals.trajectory import HighDynamics, Segment, Segments
 
 Z = 5.0
@@ -136,28 +138,25 @@ def test_compiled_epoch_is_the_python_one():
     rows = simulate_imu(motion, spec, 3, 1.0)[0][:2]
     start, (c0,) = motion([0.0]), true_attitude(motion, [0.0], "land")[0]
     bias = np.array([1e-2, -2e-2, 1e-2, 1e-5, 2e-5, -1e-5])
-    pos, vel, c, clock = (
-        start.pos_ecef_m[0].copy(),
-        start.vel_ecef_mps[0].copy(),
-        c0.copy(),
-        np.array([5.0, 0.3]),
-    )
-    p, phi, qd = np.diag(p0_of(spec)), np.empty((17, 17)), np.empty((17, 17))
-    expected = p.copy()
-    epoch = pos.copy(), vel.copy(), c.copy(), bias.copy(), clock.copy(), p
-    rates = np.array([1 / model.accel_bias_tau_s, 1 / model.gyro_bias_tau_s])
-    ecef17_epoch(
-        *epoch, rows["gyro_rad_s"].copy(), rows["accel_mps2"].copy(), DT, rates, model.q_diag(), phi, qd
-    )
+    pos, vel, c = start.pos_ecef_m[0].copy(), start.vel_ecef_mps[0].copy(), c0.copy()
+    n = 18  # and the inter-system bias
+    x, p, sensors = np.zeros(kernels.N_X), np.diag([*p0_of(spec), 1.0]), np.zeros((2, kernels.N_SENSOR))
+    x[:3], x[3:6], x[6:15], x[15:21], x[21:23] = pos, vel, c.ravel(), bias, (5.0, 0.3)
+    sensors[:, :3], sensors[:, 3:6] = rows["gyro_rad_s"], rows["accel_mps2"]
+    expected, (f, phi, qd) = p[:17, :17].copy(), (np.zeros((n, n)) for _ in range(3))
+    kernels.predict(
+        kernels.ECEF17, x, p, sensors, DT, 1.0, model_rates(model), extended_q(model, x), f, phi, qd
+    )  # fmt: skip
     for k in range(2):
-        state = EcefState(pos, vel, c, bias[:3], bias[3:], *clock)
-        f, q = discretise(model.f_matrix(state, rows["accel_mps2"][k] - bias[:3]), model.q_diag(), DT)
-        expected = f @ expected @ f.T + q
-        strapdown_step(pos, vel, c, rows["gyro_rad_s"][k] - bias[3:], rows["accel_mps2"][k] - bias[:3], DT)
-    np.testing.assert_array_equal(epoch[0], pos)
-    np.testing.assert_array_equal(epoch[2], c)
-    assert epoch[4][0] == pytest.approx(5.0 + 0.3 * 2 * DT)
-    np.testing.assert_allclose(np.diag(p), np.diag(expected), rtol=1e-4)
+        state = EcefState(pos, vel, c, bias[:3], bias[3:], 5.0, 0.3)
+        a, g = rows["accel_mps2"][k] - bias[:3], rows["gyro_rad_s"][k] - bias[3:]
+        one, q = discretise(model.f_matrix(state, a), model.q_diag(), DT)
+        expected = one @ expected @ one.T + q
+        strapdown_step(pos, vel, c, g, a, DT)
+    np.testing.assert_array_equal(x[:3], pos)
+    np.testing.assert_array_equal(x[6:15], c.ravel())
+    assert x[21] == pytest.approx(5.0 + 0.3 * 2 * DT)
+    np.testing.assert_allclose(np.diag(p)[:17], np.diag(expected), rtol=1e-4)
 
 
 def test_model_of_an_imu_has_its_noise():

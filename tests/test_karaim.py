@@ -184,6 +184,27 @@ def test_fractions_carry_their_counts_and_the_crossing_is_found():
     assert (crossing["ci_low"], crossing["ci_high"]) == (32.5, 33.0)
 
 
+def test_runs_on_samples_carry_their_counts_and_nees_its_bounds():
+    samples = [c for c in karaim.samples_cases(2) if "swept" in c.name]
+    nees = karaim.nees_cases(2)
+    assert [c.seed for c in samples] == [6, 7, 8] and [c.seed for c in nees] == list(range(20, 30))
+    one = np.zeros(3, karaim.ON_SAMPLES)
+    one["mode"], one["recovered_s"] = [b"scalar", b"vector", b"ultra_tight"], [np.nan, 3.0, 0.0]
+    made = {c: {"receivers": one.copy()} for c in samples}
+    made[samples[0]]["receivers"]["recovered_s"][1] = np.nan
+    made |= {c: {"nees": np.array([3.0, 2.0 + 0.1 * i, 4.0])} for i, c in enumerate(nees)}
+    rows = karaim_report._samples_rows(made, samples + nees)
+    away = [r for r in rows if "not back" in r["item"]]
+    assert [r["note"] for r in away] == ["3 of 3 runs", "1 of 3 runs", "0 of 3 runs"]
+    assert away[1]["ci_low"] < 1 / 3 < away[1]["ci_high"]
+    before, inside = rows[-2:]
+    assert before["ours"] == pytest.approx(3.0) and inside["ours"] == pytest.approx((2.45 + 4.0) / 2)
+    # Ten chi-square values of 3 degrees of freedom: 3 +- 1.96 sqrt(2 x 3 / 10), skewed by (1.96^2 - 1) 2 / (3 x 10) of it all.
+    low, high = karaim_report.chi2_mean_bounds(3, 10)
+    assert (low, high) == pytest.approx((3 - 1.52 + 0.19, 3 + 1.52 + 0.19), abs=0.05)
+    assert f"within {low:.2f} to {high:.2f}" in before["note"]
+
+
 def test_bounds_of_a_mean_nees():
     low, high = karaim_report.chi2_mean_bounds(5, 50)
     # Normal to a few per cent: 5 +- 1.96 sqrt(2 x 5 / 50).
@@ -279,4 +300,5 @@ def test_one_run_on_samples(monkeypatch):
     assert r["ultra_tight"]["rms_jam_2d_m"] < 3.0 and r["ultra_tight"]["recovered_s"] < 1.0
     assert r["scalar"]["n_lost"] >= 4
     rows = karaim_report._samples_rows({case: part}, [case])
-    assert len(rows) == 3 and "satellites lost" in rows[0]["note"]
+    assert len(rows) == 6 and "satellites lost" in rows[0]["note"]
+    assert [r["ours"] for r in rows[1::2]][-1] == 0.0  # ultra-tight: none stayed away

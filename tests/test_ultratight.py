@@ -114,23 +114,6 @@ def test_maps_are_the_derivative_of_injection(model):
     assert (y[cb] - x[cb], y[cd] - x[cd], y[kernels.ISB] - x[kernels.ISB]) == pytest.approx((1, 2, 3))
 
 
-@pytest.mark.parametrize("model", MODELS[:2], ids=lambda m: m.kind)
-def test_prediction_is_that_of_the_riss_spec(model):
-    x = _nominal(model)
-    p = start_covariance(model, x)
-    sensors = np.tile([0.001, 0.0, -0.05, 0.1, 0.5, -9.8, 8.7], (2, 1))
-    other, q = x[:19].copy(), p[:-1, :-1].copy()
-    phi, _ = model.epoch(other, q, -sensors[:, 2], sensors[:, 3], sensors[:, 4], sensors[:, 6], 0.01)
-    f, phi2, qd2 = (np.zeros_like(p) for _ in range(3))
-    kernels.predict(
-        ut.model_code(model), x, p, sensors, 0.01, model.pitch_filter_s, ut.model_rates(model), ut.extended_q(model, x), f,
-        phi2, qd2,
-    )  # fmt: skip
-    assert np.array_equal(other, x[:19])
-    assert phi2[:-1, :-1] == pytest.approx(phi, rel=1e-12, abs=1e-18)
-    assert p[:-1, :-1] == pytest.approx(q, rel=1e-9, abs=1e-18)
-
-
 def _pinson(wander_rad=0.3):
     x = _nominal(Pinson13())
     x[kernels.WANDER], x[kernels.BARO_ERROR] = wander_rad, 2.0

@@ -11,7 +11,7 @@ from signals.codes import secondary_code
 from signals.constants import CHIP_RATE_HZ, F_L1_HZ
 from signals.modulation import BLOCK, SIGNALS, autocorrelation, chip_acf, code_table, sampled_band_hz
 from tracking.discriminators import CARRIER_DISCRIMINATORS, CODE_DISCRIMINATORS, code_scale_chips
-from tracking.kernels import CHANNEL, HISTORY, KIND_CA, KIND_DATA, KIND_PILOT, SYMBOL, track_slab
+from tracking.kernels import CHANNEL, HISTORY, KIND_CA, KIND_DATA, KIND_PILOT, SYMBOL, survey, track_slab
 from tracking.lock import STATE_BIT_SYNC, STATE_IDLE, STATE_LOCKED, STATE_LOST, STATE_PULL_IN
 from tracking.loops import MAX_BT, adapted_gains, dll_gains, fll_gain, pll_gains
 from tracking.records import AIDING, EPOCH, REPLICA
@@ -246,6 +246,7 @@ class Tracker:
         self._hist = np.zeros((0, HISTORY, 2))
         self._commands = np.zeros(0, AIDING)
         self._pool, self._tables = np.zeros(0, np.int8), {}
+        self._shortest_s, self._longest_s = 4e-3, 0.0
         self._tail, self._end, self._begun = np.zeros((2, 0), np.int8), 0, False
         self._secondary = np.asarray(secondary_code(), np.float64)
         self._threads = ThreadPoolExecutor(spec.threads - 1) if spec.threads > 1 else None
@@ -275,6 +276,8 @@ class Tracker:
         st["doppler_hz"] = st["rate_hz"] = doppler
         st["state"] = STATE_PULL_IN
         self.channels[c] = st
+        self._shortest_s = min(self._shortest_s, float(st["period_s"]))
+        self._longest_s = max(self._longest_s, float(st["period_s"]))
         return c
 
     def release(self, c):
@@ -514,7 +517,7 @@ class Tracker:
                     self.symbols, self.symbol_counts,
                 )  # fmt: skip
 
-        active = self._running()
+        active = self._running()[0]
         if len(active):
             self._share(run, active)
         self._keep(tail[:, :n_left], iq)
@@ -539,16 +542,16 @@ class Tracker:
 
     def _head_samples(self):
         """Two of the longest code periods: a period that steering stretches is at most one and a half."""
-        return math.ceil(2.01 * self.fs_hz * float(np.max(self.channels["period_s"], initial=0.0)))
+        return math.ceil(2.01 * self.fs_hz * self._longest_s)
 
     def _most_periods(self, n):
-        shortest = float(np.min(self.channels["period_s"], initial=4e-3))
-        return int(n / (self.fs_hz * shortest) * 1.01) + 2
+        return int(n / (self.fs_hz * self._shortest_s) * 1.01) + 2
 
     def _running(self):
-        """Indices of channels that take samples."""
-        state = self.channels["state"]
-        return np.flatnonzero((state != STATE_IDLE) & (state != STATE_LOST))
+        """Indices of channels that take samples, and the oldest sample that one of them needs."""
+        which = np.empty(len(self.channels), np.int64)
+        count, oldest = survey(self.channels, which)
+        return which[:count], oldest if count else self._end
 
     def _share(self, run, active):
         """Run the channels, each on one thread."""
@@ -563,7 +566,7 @@ class Tracker:
 
     def _keep(self, left, iq):
         """Keep the samples that some channel still needs: of those ``left`` over before the slab, and of the slab."""
-        needed = self._end - int(np.min(self.channels["next_sample"][self._running()], initial=self._end))
+        needed = self._end - min(self._running()[1], self._end)
         if needed <= iq.shape[1]:
             self._tail = iq[:, iq.shape[1] - needed :].copy()
         else:

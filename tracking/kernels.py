@@ -29,6 +29,7 @@ from tracking.discriminators import (
 )
 from tracking.lock import (
     STATE_BIT_SYNC,
+    STATE_IDLE,
     STATE_LOCKED,
     STATE_LOST,
     STATE_PULL_IN,
@@ -39,7 +40,7 @@ from tracking.lock import (
 )
 from tracking.loops import ADAPT_LOW_DBHZ, ADAPT_ROWS
 
-__all__ = ["CHANNEL", "HISTORY", "SYMBOL", "track_slab"]
+__all__ = ["CHANNEL", "HISTORY", "SYMBOL", "survey", "track_slab"]
 
 HISTORY = 200
 """Prompts kept for the open-loop search: 200 ms of 1 ms (C/A), or 50 periods of 4 ms in halves (E1)."""
@@ -990,6 +991,19 @@ def _run_channel(st, until, integer, xi, xq, first, fs_hz, if_hz, pool, tap_q, s
             st.m_done, st.n_acc = 0, 0
             k += 1
     return k, n_symbols
+
+
+@njit(cache=True, nogil=True)
+def survey(ch, which):
+    """Channels that take samples into ``which`` (C,) -> (their number, the oldest sample they need; -1: none)."""
+    count, oldest = 0, np.int64(-1)
+    for c in range(len(ch)):
+        st = ch[c]
+        if st.state != STATE_IDLE and st.state != STATE_LOST:
+            which[count] = c
+            oldest = st.next_sample if count == 0 else min(oldest, st.next_sample)
+            count += 1
+    return count, oldest
 
 
 @njit(cache=True, nogil=True)

@@ -43,6 +43,8 @@ FIXED_DBHZ = 44.0
 SAMPLES_JAM_S = (45.0, 135.0)
 SAMPLES_S = 165.0
 SAMPLES_SEEDS = 3
+NEES_RUNS, NEES_JAM_S, NEES_S, NEES_AT_S = 10, (40.0, 60.0), 60.0, (39.0, 49.0, 59.0)
+"""Short runs of the ultra-tight receiver on IF samples, in the 2.4 kHz tone of 45 dB, and when its error is held against its claim."""
 LINE_PRN = 8
 """Satellite of the drive whose strongest line the CW hits."""
 
@@ -96,6 +98,14 @@ class SamplesCase(NamedTuple):
     seed: int
 
 
+class NeesCase(NamedTuple):
+    """One short run on IF samples, for consistency."""
+
+    name: str
+    jammer: Narrowband
+    seed: int
+
+
 class Size(NamedTuple):
     """How much is run."""
 
@@ -121,7 +131,7 @@ def run(out_dir, quick=False, seed=0) -> list[dict]:
     out = Path(out_dir)
     size = QUICK if quick else WHOLE
     cases = twin_cases(size)
-    samples = [] if quick else samples_cases(seed)
+    samples = [] if quick else samples_cases(seed) + nees_cases(seed)
     results = compute(out / "parts", cases, samples, size, seed)
     rows = report.rows(results, cases, samples, size)
     report.figures(out, results, size, samples, seed)
@@ -218,6 +228,13 @@ def samples_jammers() -> list[tuple[str, Narrowband | CW]]:
     return [*found, ("CW swept over +-5 kHz, J/S 45 dB", sweep)]
 
 
+def nees_cases(seed: int) -> list[NeesCase]:
+    """NEES_RUNS short runs in the tone of 45 dB."""
+    start, stop = NEES_JAM_S
+    tone = Narrowband(bandwidth_hz=BANDWIDTH_HZ, js_db=45, against="G01", start_s=start, stop_s=stop)
+    return [NeesCase("NEES, 2.4 kHz tone, J/S 45 dB", tone, NEES_RUNS * seed + i) for i in range(NEES_RUNS)]
+
+
 def samples_cases(seed: int) -> list[SamplesCase]:
     """Every jammer with SAMPLES_SEEDS seeds."""
     return [
@@ -243,7 +260,8 @@ def compute(directory: Path, cases, samples, size: Size, seed: int) -> Results:
         path = directory / _file_name(case.name, (case, size.n_runs, seed))
         work.append((case, path, twin_part, (case, size, seed, stop)))
     for one in samples:
-        work.append((one, directory / _file_name(one.name, one), samples_part, (one, stop)))
+        part = nees_part if isinstance(one, NeesCase) else samples_part
+        work.append((one, directory / _file_name(one.name, one), part, (one, stop)))
     kept = {case: arrays for case, path, _, _ in work if (arrays := _read(path)) is not None}
     todo = [w for w in work if w[0] not in kept]
     if kept:
@@ -349,16 +367,17 @@ def measure(out: np.ndarray, jam_s: tuple[float, float]) -> np.void:
 # -- IF samples -----------------------------------------------------------------------------------------------------
 
 
-def samples_scenario(jammer: Narrowband | CW, seed: int):
-    """The built-in drive with 90 s of another jammer and turns throughout."""
+def samples_scenario(jammer: Narrowband | CW, seed: int, duration_s: float | None = None):
+    """The built-in drive with another jammer (SAMPLES_S, 90 s of it) and turns throughout."""
     from sdr import scenario
 
     spec = scenario.load("drive-jam")[0]
     place = {k: getattr(spec.motion, k) for k in ("lat_deg", "lon_deg", "height_m")}
+    span_s = duration_s or SAMPLES_S
     changes = {
         "seed": seed,
-        "duration_s": SAMPLES_S,
-        "motion": uttwin.drive(SAMPLES_S, **place),
+        "duration_s": span_s,
+        "motion": uttwin.drive(span_s, **place),
         "jammer": (jammer,),
     }
     return spec.model_copy(update=changes)
@@ -378,6 +397,28 @@ def samples_part(case: SamplesCase, stop=None) -> dict[str, np.ndarray]:
     tracks, numbers = side.tracks(), side.modes()
     rows = [_receiver(mode, tracks[mode], numbers[mode]) for mode in tracks]
     return {"receivers": np.array(rows, ON_SAMPLES), **tracks}
+
+
+def nees_part(case: NeesCase, stop=None) -> dict[str, np.ndarray]:
+    """``nees`` (3,): e' P^-1 e of the position (3 degrees of freedom) at NEES_AT_S, of the ultra-tight receiver alone."""
+    from sdr import scenario
+    from sdr.receiver import Receiver
+
+    spec = samples_scenario(case.jammer, case.seed, NEES_S)
+    source = scenario.source(spec)
+    steering = spec.receiver.steering.with_mode("ultra_tight")
+    receiver = Receiver(
+        spec.receiver.model_copy(update={"steering": steering}), source, scenario.sensors(spec)
+    )
+    found = []
+    for outcome in receiver:
+        if stop is not None and stop.is_set():
+            raise Stopped
+        found += outcome.solutions
+    rows = np.concatenate(found)
+    at = rows[np.argmin(np.abs(rows["t_s"][:, None] - np.array(NEES_AT_S)), axis=0)]
+    error = at["pos_ecef_m"] - source.sky.receiver(at["t_s"])["pos_ecef_m"]
+    return {"nees": np.einsum("ei,eij,ej->e", error, np.linalg.inv(at["cov_ecef_m2"]), error)}
 
 
 def _receiver(mode: str, track: np.ndarray, numbers: dict) -> tuple:

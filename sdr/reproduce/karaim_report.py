@@ -15,6 +15,7 @@ from sdr.reproduce.karaim import (
     RECOVERED_M,
     SAMPLES_JAM_S,
     Case,
+    NeesCase,
     Results,
     SamplesCase,
     Size,
@@ -44,7 +45,9 @@ POS2D = ITEMS.index("Pos2D")
 COLORS = {"scalar": "C3", "vector": "C1", "ultra_tight": "C0"}
 
 
-def rows(results: Results, cases: list[Case], samples: list[SamplesCase], size: Size) -> list[dict]:
+def rows(
+    results: Results, cases: list[Case], samples: list[SamplesCase | NeesCase], size: Size
+) -> list[dict]:
     """All rows of the comparison."""
     runs = {case.name: results[case]["runs"] for case in cases}
     js_db = nearest_vector(runs, size)
@@ -289,7 +292,8 @@ def _q_rows():
 # -- IF samples -----------------------------------------------------------------------------------------------------
 
 
-def _samples_rows(results: Results, samples: list[SamplesCase]) -> list[dict]:
+def _samples_rows(results: Results, cases: list[SamplesCase | NeesCase]) -> list[dict]:
+    samples = [s for s in cases if isinstance(s, SamplesCase)]
     found = []
     for name in dict.fromkeys(s.name for s in samples):
         receivers = np.stack([results[s]["receivers"] for s in samples if s.name == name])
@@ -304,13 +308,40 @@ def _samples_rows(results: Results, samples: list[SamplesCase]) -> list[dict]:
             )
             item = f"IF, {name}: {r['mode'][0].decode()} Pos2D rms in the jam (m)"
             found.append(row(item, None, *interval(r["rms_jam_2d_m"]), note=note))
+            item = f"IF, {name}: {r['mode'][0].decode()} runs that were not back at the end"
+            found.append(_rate(item, ~np.isfinite(r["recovered_s"])))
+    return found + _nees_rows(results, [s for s in cases if isinstance(s, NeesCase)])
+
+
+def _nees_rows(results: Results, cases: list[NeesCase]) -> list[dict]:
+    """NEES of the ultra-tight position on IF samples, before the jam and in it."""
+    found = []
+    for name in dict.fromkeys(c.name for c in cases):
+        nees = np.stack([results[c]["nees"] for c in cases if c.name == name])
+        for part, values in (
+            ("before the jam", nees[:, 0]),
+            ("10 and 19 s into it", nees[:, 1:].mean(axis=1)),
+        ):
+            low, high = chi2_mean_bounds(3, len(values))
+            inside = "within" if low <= values.mean() <= high else "outside"
+            note = (
+                f"{inside} {low:.2f} to {high:.2f}, 95 % for 3 degrees of freedom and one instant in each of {len(values)} runs; "
+                f"of all runs {values.min():.2g} to {values.max():.2g}"
+            )
+            half = 1.96 * values.std(ddof=1) / math.sqrt(len(values))
+            found.append(
+                row(f"IF, {name}: ultra-tight, {part} (3 expected)", 3, values.mean(), values.mean() - half,
+                    values.mean() + half, note=note)
+            )  # fmt: skip
     return found
 
 
 # -- figures --------------------------------------------------------------------------------------------------------
 
 
-def figures(out: Path, results: Results, size: Size, samples: list[SamplesCase], seed: int) -> None:
+def figures(
+    out: Path, results: Results, size: Size, samples: list[SamplesCase | NeesCase], seed: int
+) -> None:
     """Spectrum (figure 12), carriers of two satellites (13, 14), the sweep, the receivers on IF samples; table 2."""
     runs = {c.name: r["runs"] for c, r in results.items() if isinstance(c, Case)}
     side_by_side(runs, nearest_vector(runs, size), out / "table2.csv")
@@ -318,7 +349,7 @@ def figures(out: Path, results: Results, size: Size, samples: list[SamplesCase],
     _figures_13_14(out, size, nearest_vector(runs, size), seed)
     _figure_sweep(out, runs, size)
     if samples:
-        _figure_samples(out, results, samples)
+        _figure_samples(out, results, [s for s in samples if isinstance(s, SamplesCase)])
 
 
 def _figure_12(out: Path) -> None:
