@@ -131,29 +131,29 @@ class NoiseRmdRun:
 
 
 @njit(cache=True, nogil=True)
-def follow(first, samples, state, error, cn0, bandwidth, counts, slot, ring, done, last):
+def follow(epochs, counts, slot, ring, done, last):
     """Differences of successive code discriminators of all channels of a slab, in chips, into ``ring`` (S, N).
 
-    Columns of EPOCH, each (C, n); ``counts`` (C,) of them valid; ``slot`` (C,) row of each channel, -1: none.
-    ``done`` (S,) differences so far; ``last`` (S, 6): sample after the last integration in lock (-1: none), its
-    discriminator, and of the newest integration its samples, C/N0 (dB-Hz), loop bandwidth (Hz) and whether it was in lock
-    (-1: nothing new).
+    ``epochs`` (C, n) EPOCH, ``counts`` (C,) of them valid; ``slot`` (C,) row of each channel, -1: none. ``done`` (S,) differences
+    so far; ``last`` (S, 6): sample after the last integration in lock (-1: none), its discriminator, and of the newest
+    integration its samples, C/N0 (dB-Hz), loop bandwidth (Hz) and whether it was in lock (-1: nothing new).
     """
     for c in range(counts.size):
         s = slot[c]
         if s < 0 or counts[c] == 0:
             continue
         for k in range(counts[c]):
-            if state[c, k] != STATE_LOCKED:
+            e = epochs[c, k]
+            if e.state != STATE_LOCKED:
                 last[s, 0] = -1.0
                 continue
-            if last[s, 0] == first[c, k]:
-                ring[s, done[s] % ring.shape[1]] = error[c, k] - last[s, 1]
+            if last[s, 0] == e.sample_index:
+                ring[s, done[s] % ring.shape[1]] = e.code_error_chips - last[s, 1]
                 done[s] += 1
-            last[s, 0], last[s, 1] = first[c, k] + samples[c, k], error[c, k]
-        k = counts[c] - 1
-        last[s, 2], last[s, 3], last[s, 4] = samples[c, k], cn0[c, k], bandwidth[c, k]
-        last[s, 5] = 1.0 if state[c, k] == STATE_LOCKED else 0.0
+            last[s, 0], last[s, 1] = e.sample_index + e.n_samples, e.code_error_chips
+        e = epochs[c, counts[c] - 1]
+        last[s, 2], last[s, 3], last[s, 4] = e.n_samples, e.cn0_dbhz, e.dll_bw_hz
+        last[s, 5] = 1.0 if e.state == STATE_LOCKED else 0.0
 
 
 @njit(cache=True, nogil=True)
@@ -183,10 +183,7 @@ class DiscriminatorNoise:
         ``loops``: the TrackingSpec."""
         if channels != self._channels or len(counts) != len(self._slot):
             self._seat(channels, len(counts), loops)
-        follow(
-            epochs["sample_index"], epochs["n_samples"], epochs["state"], epochs["code_error_chips"], epochs["cn0_dbhz"],
-            epochs["dll_bw_hz"], counts, self._slot, self._ring, self._done, self._last,
-        )  # fmt: skip
+        follow(epochs, counts, self._slot, self._ring, self._done, self._last)
 
     def _seat(self, channels, n_channels, loops) -> None:
         """A row for every satellite that has none, and the row of each channel."""

@@ -470,19 +470,23 @@ class _Clocked:
         return result
 
 
+INTEGRITY_FROM_S, INTEGRITY_TO_S = 45.0, 75.0
+"""Time over which the integrity monitors' share is taken: one period of ALS on 50 Hz, its pause included, two on 5 Hz."""
+
+
 def _integrity(name: str) -> float:
-    """Share of the integrity monitors, and of the log kept for them, in the receiver's CPU time; the last 10 of 50 s."""
-    spec, _ = scenario.load(name, ["duration_s=50.0", "fault=[]"])
+    """Share of the integrity monitors, and of the log kept for them, in the receiver's CPU time."""
+    spec, _ = scenario.load(name, [f"duration_s={INTEGRITY_TO_S}", "fault=[]"])
     source = _Clocked(scenario.source(spec), ("read",))
     receiver: Any = Receiver(spec.receiver, source, scenario.sensors(spec))
-    parts = [_Clocked(receiver.integrity)]
-    receiver.integrity = parts[0]
-    if receiver.navigator.log is not None:
-        parts.append(_Clocked(receiver.navigator.log, ("predicted", "updated")))
-        receiver.navigator.log = parts[1]
+    receiver.integrity = _Clocked(receiver.integrity)
+    parts, log = [receiver.integrity], receiver.navigator.log
+    for method in () if log is None else ("predicted", "updated"):
+        parts.append(_Clocked(getattr(log, method)))
+        setattr(log, method, parts[-1])
     begin, before = 0.0, 0.0
     for outcome in receiver:
-        if begin == 0.0 and outcome.n_end >= 40.0 * receiver.fs_hz:
+        if begin == 0.0 and outcome.n_end >= INTEGRITY_FROM_S * receiver.fs_hz:
             begin = time.process_time()
             before = source.seconds
             for part in parts:

@@ -101,7 +101,7 @@ class SteeringWatch:
         names = [None if n is None else f"{'G' if n[0] == 'L1CA' else 'E'}{n[1]:02d}" for n in st.name]
         self._ready = self.points.close(sample / st.fs_hz, names, st.inflate, self.filter.p)
         self.fresh = self.points.epochs
-        self._single.append(self.points.single)
+        self._single.append(self.points.single.copy())
         return self._ready
 
     @property

@@ -252,9 +252,11 @@ def test_parallel_filters_name_whom_they_may_mean():
 
 
 @pytest.mark.slow
-def test_on_samples_listening_changes_no_bit_and_the_filter_is_watched():
-    """46 s of the built-in scenario: commands, positions and epochs with all monitors on are those without any."""
-    spec = scenario.load("integrity-ut-bias", ["duration_s=46.0", "fault=[]", "jammer=[]"])[0]
+@pytest.mark.parametrize("name", ["integrity-ut-bias", "integrity-ramp"])
+def test_on_samples_listening_changes_no_bit_and_the_filter_is_watched(name):
+    """46 s of a built-in scenario, ultra-tight and scalar: positions and epochs with all monitors on are those without any."""
+    quiet = [] if name == "integrity-ramp" else ["jammer=[]"]
+    spec = scenario.load(name, ["duration_s=46.0", "fault=[]", *quiet])[0]
     results = []
     for update in ({"respond": RespondSpec()}, {"respond": RespondSpec(), "integrity": None}):
         receiver = Receiver(
@@ -262,7 +264,7 @@ def test_on_samples_listening_changes_no_bit_and_the_filter_is_watched():
         )
         results.append((receiver, list(Receiver.__iter__(receiver))))
     (with_all, a), (_, b) = results
-    assert with_all.integrity.steered is not None
+    assert (with_all.integrity.steered is not None) == (spec.receiver.steering.mode == "ultra_tight")
     for one_, two in zip(a, b, strict=True):
         for x, y in zip(one_.solutions, two.solutions, strict=True):
             assert x.tobytes() == y.tobytes()
