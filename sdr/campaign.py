@@ -202,7 +202,7 @@ class CampaignSpec(_Spec):
     """The jammer (kind "CW" or "NBI") with its settings."""
     monitor: tuple[MonitorSpec, ...] = Field(min_length=1, max_length=32)
     grid: dict[str, Any] = {}
-    """Dotted key -> list of values; the points are all combinations."""
+    """Dotted key -> list of values; the points are all combinations. The key jammer alone takes whole jammers, of several kinds."""
     trial: TrialSpec = TrialSpec()
     training: Length = Length()
     threshold: Length = Length(trials=40, epochs=25_000)

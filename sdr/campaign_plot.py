@@ -2,35 +2,30 @@
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from sdr import farm, tally
-from sdr.campaign import CURVE_EDGES, ROC_P_FA
+from sdr.campaign import CURVE_EDGES, ROC_P_FA, THRESHOLD, TRIAL
 from sdr.reproduce import new_figure, save_figure
 
-
-def mask_dbw(bandwidth_hz: Any) -> np.ndarray:
-    """Tolerable in-band power against bandwidth, after the steady-state mask of RTCA DO-229D, appendix C.
-
-    -150.5 dBW up to 700 Hz, then 6 dB a decade to 10 kHz, 3 dB a decade to 100 kHz, flat to 1 MHz. The corner
-    values are assumed (not checked against the document).
-    """
-    b = np.asarray(bandwidth_hz, float)
-    rise = 6.0 * np.log10(np.clip(b, 700.0, 1e4) / 700.0) + 3.0 * np.log10(np.clip(b, 1e4, 1e5) / 1e4)
-    return -150.5 + rise
+_DATASETS = {
+    "rates": farm.RATE, "trials": TRIAL, "thresholds": THRESHOLD, "advantages": farm.ADVANTAGE, "mask": farm.MASK,
+}  # fmt: skip
+"""What is drawn; a dataset without rows is not in the file."""
 
 
 def plot(path: Path | str, directory: Path | None = None) -> list[Path]:
     """Draw the figures of a campaign's results; returns their paths."""
     out = directory or Path(path).with_suffix("")
     with farm.read_rates(path) as h5:
-        rates, trials, limits, gains = (
-            h5[f"campaign/{n}"][:] for n in ("rates", "trials", "thresholds", "advantages")
-        )
+        kept = {
+            name: h5[f"campaign/{name}"][:] if f"campaign/{name}" in h5 else np.zeros(0, dtype)
+            for name, dtype in _DATASETS.items()
+        }
         axes = json.loads(h5["campaign/points"].attrs["axes"])
         twin = json.loads(h5.attrs["scenario"]).get("twin", {})
+    rates, trials, limits, gains, scan = kept.values()
     jammed = np.array([a.get("jammer.kind") != "none" for a in axes])
     quiet_trials = trials[~jammed[trials["point"]]]
     rates, trials = rates[jammed[rates["point"]]], trials[jammed[trials["point"]]]
@@ -40,8 +35,8 @@ def plot(path: Path | str, directory: Path | None = None) -> list[Path]:
         _rates(rates, gains, axes, out), _curves(rates, trials, axes, out), _roc(trials, quiet_trials, limits, axes, names, out),
         _first_alarms(trials, axes, names, out), _errors(trials, axes, names, out),
     ]  # fmt: skip
-    if twin and {"jammer.bandwidth_hz", "jammer.offset_hz", "jammer.power_dbw"} <= set(axes[0]):
-        drawn.append(_mask(rates, trials, axes, float(twin["cn0_dbhz"]), out))
+    if len(scan):
+        drawn.append(_mask(scan, trials, axes, float(twin["cn0_dbhz"]), out))
     return [p for p in drawn if p is not None]
 
 
@@ -206,66 +201,37 @@ def _errors(trials: np.ndarray, axes: list[dict], names: list[str], out: Path) -
     return save_figure(fig, out, "errors")
 
 
-def mask_table(
-    rates: np.ndarray, trials: np.ndarray, axes: list[dict], cn0_dbhz: float
-) -> list[dict[str, Any]]:
-    """Per bandwidth: the worst offset, and the least power that costs 1 dB, loses lock, and is first detected.
-
-    "Worst" is the offset with the largest C/N0 loss summed over the powers, each counted up to 10 dB (lost: 10).
-    """
-    out = []
-    first = trials[trials["monitor"] == 0]
-    monitors = list(dict.fromkeys(r["monitor"].decode() for r in rates))
-    for bandwidth in sorted({a["jammer.bandwidth_hz"] for a in axes}):
-        cells: dict[float, list] = {}
-        for p in np.unique(first["point"]):
-            a, rows = axes[p], first[first["point"] == p]
-            if a["jammer.bandwidth_hz"] == bandwidth:
-                missed = {r["monitor"].decode(): float(r["rate"]) for r in rates if r["point"] == p}
-                entry = (
-                    a["jammer.power_dbw"],
-                    cn0_dbhz - float(np.mean(rows["cn0_dbhz"])),
-                    float(np.mean(rows["lost"])),
-                    missed,
-                )
-                cells.setdefault(a["jammer.offset_hz"], []).append(entry)
-        least = lambda rows, test: min((r[0] for r in rows if test(r)), default=None)  # noqa: E731
-        worst = max(cells, key=lambda o: sum(10.0 if r[2] > 0.5 else min(r[1], 10.0) for r in cells[o]))
-        rows = sorted(cells[worst], key=lambda r: r[0])
-        out.append({
-            "bandwidth_hz": bandwidth, "worst_offset_hz": worst, "mask_dbw": float(mask_dbw(bandwidth)),
-            "loss_1db_dbw": least(rows, lambda r: r[1] >= 1.0), "loss_of_lock_dbw": least(rows, lambda r: r[2] > 0.5),
-            "detected_dbw": {m: least(rows, lambda r, m=m: r[3][m] < 0.5) for m in monitors},
-        })  # fmt: skip
-    return out
-
-
-def _mask(rates: np.ndarray, trials: np.ndarray, axes: list[dict], cn0_dbhz: float, out: Path) -> Path:
-    table = mask_table(rates, trials, axes, cn0_dbhz)
+def _mask(scan: np.ndarray, trials: np.ndarray, axes: list[dict], cn0_dbhz: float, out: Path) -> Path:
+    """Least power that does harm or is detected at each bandwidth's worst lobe, and the lobes themselves."""
     first = trials[trials["monitor"] == 0]
     fig, panels = new_figure(1, 2, size=(12, 5))
-    width = [max(t["bandwidth_hz"], 30.0) for t in table]
-    number = lambda key: [np.nan if t[key] is None else t[key] for t in table]  # noqa: E731
+    names = list(dict.fromkeys(scan["monitor"]))
+    one = scan[scan["monitor"] == names[0]]
+    width = np.maximum(one["bandwidth_hz"], 30.0)
     grid = np.logspace(1.5, 6, 200)
-    panels[0].semilogx(grid, mask_dbw(grid), "k", label="mask (assumed)")
-    panels[0].semilogx(width, number("loss_1db_dbw"), "o-", label="1 dB of C/N0 lost")
-    panels[0].semilogx(width, number("loss_of_lock_dbw"), "s-", label="lock lost")
-    for name in table[0]["detected_dbw"]:
-        detected = [np.nan if t["detected_dbw"][name] is None else t["detected_dbw"][name] for t in table]
-        panels[0].semilogx(width, detected, "^--", label=f"{name}: P_MD < 0.5")
-    panels[0].set(xlabel="bandwidth (Hz); leftmost: tone", ylabel="least power (dBW), worst offset")
+    panels[0].semilogx(grid, tally.mask_dbw(grid), "k", label="mask (assumed)")
+    panels[0].semilogx(width, one["loss_1db_dbw"], "o-", label="1 dB of C/N0 lost")
+    panels[0].semilogx(width, one["loss_of_lock_dbw"], "s-", label="lock lost")
+    for name in names:
+        detected = scan["detected_dbw"][scan["monitor"] == name]
+        panels[0].semilogx(width, detected, "^--", label=f"{name.decode()}: P_MD < 0.5")
+    line = one["worst_line_hz"][np.isfinite(one["worst_line_hz"])]
+    title = f"worst line {line[0] / 1e3:g} kHz" if len(line) else "worst lobes"
+    panels[0].set(
+        xlabel="bandwidth (Hz); leftmost: tone", ylabel="least power (dBW), worst lobe", title=title
+    )
     panels[0].legend(fontsize=7)
     strongest = sorted({a["jammer.power_dbw"] for a in axes})
     power = strongest[len(strongest) // 2]
-    for t in table:
+    for bandwidth in one["bandwidth_hz"]:
         points = [
             p
             for p in np.unique(first["point"])
-            if axes[p]["jammer.bandwidth_hz"] == t["bandwidth_hz"] and axes[p]["jammer.power_dbw"] == power
+            if axes[p]["jammer.bandwidth_hz"] == bandwidth and axes[p]["jammer.power_dbw"] == power
         ]
         x = [axes[p]["jammer.offset_hz"] / 1e3 for p in points]
         y = [cn0_dbhz - np.mean(first["cn0_dbhz"][first["point"] == p]) for p in points]
-        panels[1].plot(x, y, ".-", label=f"{t['bandwidth_hz']:g} Hz")
+        panels[1].plot(x, y, ".-", label=f"{bandwidth:g} Hz" if bandwidth else "tone")
     panels[1].set(xlabel="offset (kHz)", ylabel="C/N0 loss (dB)", title=f"{power:g} dBW")
     panels[1].legend(fontsize=7)
     for panel in panels:

@@ -24,7 +24,7 @@ from sdr import store, version
 from sdr.campaign import THRESHOLD, TRIAL, Campaign, load
 from sdr.crew import each, hire
 from sdr.jobs import _progress
-from sdr.tally import PointCount, advantages, summarise
+from sdr.tally import PointCount, advantages, mask, summarise
 from sdr.trials import evaluate_trials, fit_thresholds, quiet_statistics, warm_up
 
 CHUNK_S = 1.0
@@ -65,6 +65,22 @@ ADVANTAGE = np.dtype(
     ]
 )
 """Jammer power that one monitor needs for one P_MD, and its advantage over the first monitor; NaN: not crossed."""
+
+
+MASK = np.dtype(
+    [
+        ("bandwidth_hz", "f8"),  # 0: a tone
+        ("monitor", "S16"),
+        ("worst_offset_hz", "f8"),  # of the grid's offsets
+        ("worst_line_hz", "f8"),  # the code line that the tone was put on there
+        ("worst_line_db", "f8"),  # its level, power of the code = 1
+        ("mask_dbw", "f8"),  # what the mask tolerates
+        ("loss_1db_dbw", "f8"),  # least power that costs 1 dB of C/N0
+        ("loss_of_lock_dbw", "f8"),
+        ("detected_dbw", "f8"),  # least power with P_MD below 1/2
+    ]
+)
+"""Mask scan: the worst lobe at each bandwidth and the least powers of the grid there; NaN: none."""
 
 
 def run(
@@ -290,6 +306,7 @@ class Results:
         )
         out.append("campaign/rates", table)
         out.append("campaign/advantages", np.array([_advantage(r) for r in self.advantages()], ADVANTAGE))
+        out.append("campaign/mask", np.array([_mask_row(r) for r in mask(self.campaign, rates)], MASK))
         out.checkpoint(complete=complete)
         self.complete = complete
         self._last = time.monotonic()
@@ -307,6 +324,7 @@ class Results:
         """The command's JSON object."""
         spec = self.campaign.spec
         trials = sum(c.done for c in self.counts)
+        rows = self.rows()
         return {
             "name": spec.name,
             "output": str(self.path),
@@ -315,14 +333,20 @@ class Results:
             "resumed_trials": self.resumed,
             "epochs": sum(c.done * self.campaign.length(c.index).epochs for c in self.counts),
             "p_fa": spec.p_fa_test,
-            "points": self.rows(),
+            "points": rows,
             "advantages": self.advantages(),
+            "mask": mask(self.campaign, rows),
         }
 
 
 def _for_hdf5(rows: list[dict[str, Any]]) -> Iterator[dict[str, Any]]:
     for r in rows:
         yield r | {"monitor": r["monitor"].encode(), "stop_reason": (r["stop_reason"] or "").encode()}
+
+
+def _mask_row(r: dict[str, Any]) -> tuple:
+    values = (np.nan if r[n] is None else r[n] for n in MASK.names or ())
+    return tuple(v.encode() if isinstance(v, str) else v for v in values)
 
 
 def _advantage(r: dict[str, Any]) -> tuple:
@@ -449,6 +473,7 @@ def _text(out: dict[str, Any]) -> str:
         rows[0] += f" ({out['resumed_trials']} trials were there already)"
     rows += [_point_text(r) for r in out["points"]]
     rows += [_advantage_text(r) for r in out["advantages"]]
+    rows += [_mask_text(r) for r in out["mask"]]
     rows.append(f"results in {out['output']}")
     return "\n".join(rows + [f"  {p}" for p in out.get("figures", [])])
 
@@ -482,6 +507,22 @@ def _advantage_text(r: dict[str, Any]) -> str:
     if r["monitor"] != r["against"]:
         text += f"; {told(r['gain_db'], r['gain_ci_db'], '+')} dB against {r['against']}"
     return f"{text}  {_axes_text(r['axes'])}"
+
+
+def _mask_text(r: dict[str, Any]) -> str:
+    told = {
+        k: "not in the grid" if r[k] is None else f"{r[k]:g}" for k in MASK.names or () if k.endswith("dbw")
+    }
+    what = f"{r['bandwidth_hz']:g} Hz" if r["bandwidth_hz"] else "tone"
+    line = (
+        ""
+        if r["worst_line_hz"] is None
+        else f", line {r['worst_line_hz'] / 1e3:g} kHz ({r['worst_line_db']:.2f} dB)"
+    )
+    return (
+        f"  mask, {what}: worst at {r['worst_offset_hz'] / 1e3:g} kHz{line}; 1 dB lost from {told['loss_1db_dbw']}, lock from "
+        f"{told['loss_of_lock_dbw']}, {r['monitor']} detects from {told['detected_dbw']} dBW (mask {told['mask_dbw']})"
+    )
 
 
 def _axes_text(axes: dict[str, Any]) -> str:

@@ -77,7 +77,7 @@ class RecordedSpec(_Spec):
     jammer: dict[str, Any] = Field(default_factory=dict)
     """One jammer of a scenario, its power as jn0_dbhz or power_dbw; kind "none" for none."""
     grid: dict[str, Any] = Field(default_factory=dict)
-    """Dotted key, beginning with jammer., -> list of values."""
+    """Dotted key, beginning with jammer., -> list of values; jammer alone -> list of whole jammers."""
     receiver: ReceiverSpec
     """The receiver with its monitors."""
     requirement: str = "APV-I"

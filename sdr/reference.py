@@ -286,6 +286,7 @@ def results_lines() -> Iterator[str]:
         ("thresholds (campaigns)", sdr.campaign, "THRESHOLD"),
         ("rates (campaigns)", sdr.farm, "RATE"),
         ("advantages (campaigns)", sdr.farm, "ADVANTAGE"),
+        ("mask (campaigns)", sdr.farm, "MASK"),
     ):
         yield from record_lines(place, module, name)
 

@@ -13,6 +13,8 @@ from monitors.detection import Rate, clopper_pearson, cluster_rate, rate
 from monitors.rare import repeated_rate
 from monitors.threshold import per_approach
 from sdr.campaign import ROC_P_FA, Campaign, CampaignSpec
+from signals.modulation import SIGNALS
+from tracking.correlator_model import code_spectrum
 
 _COUNTED = {"hit": "hit", "all": "on", "event": "event", "hazard": "hazard"}
 _ERRORS = (
@@ -184,8 +186,12 @@ def _summary_row(
     row |= _roc(rows, limit, c.jammed) | _first_alarm(rows, c.jammed)
     if not c.jammed and not campaign.live:
         row |= _approach(rows, campaign, c.index)
+    held = rows[
+        ~rows["lost"]
+    ]  # a lost carrier's range error says how long it was lost, not what a monitor missed
     for field in _ERRORS:
         row[field] = _number(np.max(rows[field]))
+        row[f"held_{field}"] = _number(np.max(held[field])) if len(held) else None
         row[f"{field[:-2]}_median_ci_m"] = median(rows[field])
     row["cn0_dbhz"] = _number(np.mean(rows["cn0_dbhz"]))
     row["lost_trials"] = int(rows["lost"].sum())
@@ -327,3 +333,60 @@ def _percentiles(x: np.ndarray) -> list[float | None]:
     if not np.isfinite(x[0]) or len(good) < 0.99 * (len(x) - 1):
         return [None, None]
     return [float(v) for v in np.quantile(good, [0.025, 0.975])]
+
+
+# -- the mask of a scan -------------------------------------------------------------------------------------------
+
+SCAN = {"jammer.bandwidth_hz", "jammer.offset_hz", "jammer.power_dbw"}
+"""Axes that make a campaign a mask scan."""
+
+
+def mask_dbw(bandwidth_hz: Any) -> np.ndarray:
+    """Tolerable in-band power against bandwidth, after the steady-state mask of RTCA DO-229D, appendix C.
+
+    -150.5 dBW up to 700 Hz, then 6 dB a decade to 10 kHz, 3 dB a decade to 100 kHz, flat to 1 MHz. The corner
+    values are assumed (not checked against the document).
+    """
+    b = np.asarray(bandwidth_hz, float)
+    rise = 6.0 * np.log10(np.clip(b, 700.0, 1e4) / 700.0) + 3.0 * np.log10(np.clip(b, 1e4, 1e5) / 1e4)
+    return -150.5 + rise
+
+
+def mask(campaign: Any, rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Per bandwidth and monitor: the worst lobe, for a tone its line, and the least power there that costs 1 dB of C/N0,
+    loses lock (more than half of the trials) and is detected (P_MD below 1/2); null: none of the grid does.
+
+    "Worst" is the offset with the largest C/N0 loss summed over the powers, each counted up to 10 dB (lost: 10).
+    ``rows``: summary rows of the points that have trials.
+    """
+    if campaign.live or not set(campaign.axes) >= SCAN:
+        return []
+    jammed = [r for r in rows if r["point"] < campaign.total]
+    out = []
+    for bandwidth in sorted(campaign.axes["jammer.bandwidth_hz"]):
+        wide = [r for r in jammed if r["axes"]["jammer.bandwidth_hz"] == bandwidth]
+        for name in dict.fromkeys(r["monitor"] for r in wide):
+            mine = [r for r in wide if r["monitor"] == name]
+            out.append({"bandwidth_hz": bandwidth, "monitor": name, **_worst_lobe(campaign, mine)})
+    return out
+
+
+def _worst_lobe(campaign: Any, rows: list[dict[str, Any]]) -> dict[str, Any]:
+    lobes: dict[float, list[tuple[float, float, bool, bool]]] = {}
+    for r in rows:
+        loss_db = campaign.points[r["point"]].cn0_dbhz - (r["cn0_dbhz"] or 0.0)
+        entry = r["axes"]["jammer.power_dbw"], loss_db, r["lost_trials"] > 0.5 * r["trials"], r["rate"] < 0.5
+        lobes.setdefault(r["axes"]["jammer.offset_hz"], []).append(entry)
+    worst = max(lobes, key=lambda o: sum(10.0 if lost else min(db, 10.0) for _, db, lost, _ in lobes[o]))
+    at = next(r["point"] for r in rows if r["axes"]["jammer.offset_hz"] == worst)
+    twin, jammer = campaign.points[at], campaign.points[at].jammers[0]
+    line = jammer.line if jammer.kind == "CW" and isinstance(jammer.line, int) else None
+    least = lambda test: min((e[0] for e in lobes[worst] if test(e)), default=None)  # noqa: E731
+    return {
+        "worst_offset_hz": worst,
+        "worst_line_hz": None if line is None else line / SIGNALS[twin.signal].code_period_s,
+        "worst_line_db": None if line is None else 20 * math.log10(abs(code_spectrum(twin.signal, twin.prn, line, twin.waveform))),
+        "mask_dbw": float(mask_dbw(rows[0]["axes"]["jammer.bandwidth_hz"])),
+        "loss_1db_dbw": least(lambda e: e[1] >= 1.0), "loss_of_lock_dbw": least(lambda e: e[2]),
+        "detected_dbw": least(lambda e: e[3]),
+    }  # fmt: skip

@@ -294,6 +294,15 @@ def test_no_errors_is_a_bound():
     assert r.high > 0.08
 
 
+def test_whole_jammers_are_an_axis():
+    """Kinds differ in their keys: each value of the axis is a jammer of its own, and the points differ by it alone."""
+    cw, noise = {"kind": "CW", "js_db": 6.0}, {"kind": "NBI", "js_db": 6.0, "bandwidth_hz": 1e4}
+    c = from_table(table(jammer={}, grid={"jammer": [cw, noise]}))
+    kinds = [p.jammers[0].kind for p in c.points]
+    assert kinds == ["CW", "NBI"] and c.group == [0, 0]
+    assert c.points[1].jammers[0].bandwidth_hz == 1e4
+
+
 # -- refusals -----------------------------------------------------------------------------------------------------
 
 
@@ -318,6 +327,7 @@ def test_no_errors_is_a_bound():
             "at most 20000",
         ),
         ({"p_fa": 0.7}, "less than 0.5"),
+        ({"name": "../elsewhere"}, "name"),
         ({"requirement": "APV-II", "p_fa": None}, "APV-II has no published P_FA"),
         ({"stop": {"max_trails": 3}}, "max_trails"),
         ({"twin": TABLE["twin"] | {"integration_s": 0.1}}, "vectors"),  # AR with 30 vectors in 3 s

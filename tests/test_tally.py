@@ -137,3 +137,51 @@ def test_times_and_errors_have_intervals(told):
             assert a <= b <= c <= p[f"undetected_{kind}_error_m"] <= p[f"max_{kind}_error_m"]
     names = {f.stem for f in campaign_plot.plot(out)}
     assert {"rates", "p_md_curve", "roc", "first_alarm", "errors"} <= names
+
+
+def test_a_lost_carrier_is_left_out_of_the_errors_that_were_held(told):
+    """Its range error says how long it was lost; what is told of the others is their largest."""
+    result, out = told
+    c = from_table(TABLE)
+    with farm.Results(c, out) as results:
+        point = results.counts[0]
+    for trial in point.rows[:-1]:
+        trial["lost"], trial["max_code_error_m"] = True, 1e6
+    (row, *_) = tally.summarise(c, [point], results.thresholds)
+    assert row["max_code_error_m"] == 1e6 and row["lost_trials"] == len(point.rows) - 1
+    assert row["held_max_code_error_m"] == pytest.approx(float(point.rows[-1]["max_code_error_m"][0]))
+    assert result["points"][0]["held_max_code_error_m"] < 1e6
+
+
+def test_a_mask_scan_finds_the_worst_line_by_itself(tmp_path):
+    """The published worst line of PRN 6, 227 kHz at -21.29 dB, from lobes of 100 kHz; its powers are those of its lobe."""
+    scan = {
+        "name": "scan", "p_fa": 1e-2, "signal_dbw": -164.0,
+        "twin": {"signal": "L1CA", "prn": 6, "cn0_dbhz": 40.5, "integration_s": 0.02},
+        "jammer": {"kind": "NBI", "freq_hz": 0.0, "search_hz": 1e5, "cross_hz_s": 2.0},
+        "monitor": [{"name": "fft", "detector": {"kind": "FFT"}}, {"name": "glrt", "detector": {"kind": "GLRT"}}],
+        "grid": {"jammer": {"bandwidth_hz": [0.0, 1e4], "offset_hz": [50e3, 250e3, 950e3],
+                            "power_dbw": [-175.0, -165.0, -160.0]}},
+        "trial": {"epochs": 500, "settle_epochs": 100}, "training": {"trials": 2, "epochs": 3000},
+        "threshold": {"trials": 4, "epochs": 6000}, "stop": {"max_trials": 2, "definition": "all"},
+    }  # fmt: skip
+    result = farm.execute(from_table(scan), tmp_path / "scan.h5", workers=1, plots=True)
+    assert [(r["bandwidth_hz"], r["monitor"]) for r in result["mask"]] == [
+        (0.0, "fft"), (0.0, "glrt"), (1e4, "fft"), (1e4, "glrt"),
+    ]  # fmt: skip
+    tone, _, noise, _ = result["mask"]
+    assert tone["worst_offset_hz"] == 250e3 and tone["worst_line_hz"] == 227e3
+    assert tone["worst_line_db"] == pytest.approx(-21.29, abs=0.01)
+    assert noise["worst_line_hz"] is None
+    assert tone["mask_dbw"] == -150.5 and noise["mask_dbw"] == pytest.approx(-143.57, abs=0.01)
+    at = [p for p in result["points"] if p["monitor"] == "fft" and p["axes"]["jammer.offset_hz"] == 250e3]
+    at = [p for p in at if p["axes"]["jammer.bandwidth_hz"] == 0.0]
+    assert tone["loss_1db_dbw"] == min(
+        p["axes"]["jammer.power_dbw"] for p in at if 40.5 - p["cn0_dbhz"] >= 1.0
+    )
+    assert tone["detected_dbw"] == min(p["axes"]["jammer.power_dbw"] for p in at if p["rate"] < 0.5)
+    assert "line 227 kHz (-21.29 dB)" in result["text"]
+    with store.read(tmp_path / "scan.h5") as h5:
+        rows = h5["campaign/mask"][:]
+    assert rows["worst_line_hz"][0] == 227e3 and np.isnan(rows["worst_line_hz"][2])
+    assert (tmp_path / "scan" / "mask.png").exists()
