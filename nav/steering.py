@@ -143,6 +143,7 @@ class Steering:
         self.inflate, self.which = np.ones(2 * SLOTS), np.zeros(SLOTS, np.int64)
         self.orbit, self.toe_toc_tgd = np.zeros((SLOTS, 19)), np.zeros((SLOTS, 3))
         self.name: list[tuple[str, int] | None] = [None] * SLOTS
+        self._taken = [b""] * SLOTS  # EPHEMERIS of each, as bytes
         self._ratio, self._missing_s, self._next_refresh = 1.0, 0.0, 0
 
     def _read_sensors(self):
@@ -274,6 +275,7 @@ class Steering:
     def _set_orbit(self, i, eph):
         self.orbit[i] = orbit_coefficients(np.array([eph], EPHEMERIS))[0]
         self.toe_toc_tgd[i] = eph["toe_s"], eph["toc_s"], eph["tgd_s"]
+        self._taken[i] = eph.tobytes()
 
     def drop(self, i: int):
         """Leave channel slot i to its own loops."""
@@ -340,7 +342,7 @@ class Steering:
             assert name is not None
             signal, prn = name
             eph = newest.get(("G" if signal == "L1CA" else "E", prn))
-            if eph is not None:
+            if eph is not None and eph.tobytes() != self._taken[i]:
                 self._set_orbit(i, eph)
         pos, vel = self.filter.position()
         sats = np.zeros(rows.size, SATELLITE)
