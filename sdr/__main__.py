@@ -373,24 +373,39 @@ def _plain(value: Any) -> Any:
 
 def main() -> None:
     """Entry point: run a command; bad input is one sentence and exit code 2, an interrupt is 130."""
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    heard: list[int] = []
+
+    def interrupt(number: int, frame: object) -> None:
+        heard.append(number)
+        raise KeyboardInterrupt
+
+    # A shell's background jobs ignore SIGINT, and go on doing so.
+    for number in (signal.SIGTERM, signal.SIGINT):
+        if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
+            signal.signal(number, interrupt)
     sys.unraisablehook = _interrupt_again
     try:
         app(exit_on_error=False, print_error=False)
-    except CycloptsError as err:
+    except (KeyboardInterrupt, Exception) as err:
+        # Compiled code may answer an interrupt with an error of its own.
+        if heard or isinstance(err, KeyboardInterrupt):
+            print("gnssbb: interrupted", file=sys.stderr)
+            sys.exit(130)
+        _explain(err)
+
+
+def _explain(err: Exception) -> None:
+    """One sentence and exit code 2 for what is not this program's fault; anything else is raised again."""
+    if isinstance(err, CycloptsError):
         _fail(" ".join(str(err).split()))
-    except KeyboardInterrupt:
-        print("gnssbb: interrupted", file=sys.stderr)
-        sys.exit(130)
-    except BrokenPipeError:
+    if isinstance(err, BrokenPipeError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(0)
-    except (ValueError, OSError, ImportError) as err:
-        if "GNSSBB_DEBUG" in os.environ:
-            raise
-        _fail(str(err))
-    except MemoryError:
+    if isinstance(err, MemoryError):
         _fail("not enough memory; use a shorter duration or a lower sample rate")
+    if "GNSSBB_DEBUG" in os.environ or not isinstance(err, ValueError | OSError | ImportError):
+        raise err
+    _fail(str(err))
 
 
 def _interrupt_again(dropped: "sys.UnraisableHookArgs") -> None:

@@ -179,3 +179,26 @@ def test_an_interrupt_in_a_destructor_is_not_lost(monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         Dying()
         time.sleep(10)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_an_interrupt_answered_with_another_error_exits_130(monkeypatch, number):
+    """Compiled libraries turn an exception that a signal raised inside them into TypeError or SystemError."""
+
+    def job(**_):
+        try:
+            signal.raise_signal(number)
+        except KeyboardInterrupt:
+            raise SystemError("returned a result with an exception set") from None
+
+    before = {n: signal.getsignal(n) for n in (signal.SIGTERM, signal.SIGINT)}
+    monkeypatch.setattr(command_line, "app", job)
+    monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)
+    _hear_interrupts()
+    try:
+        with pytest.raises(SystemExit) as left:
+            command_line.main()
+    finally:
+        for n, handler in before.items():
+            signal.signal(n, handler)
+    assert left.value.code == 130
