@@ -113,6 +113,7 @@ def _roc(trials: np.ndarray, quiet: np.ndarray, limits: np.ndarray, axes: list[d
     fig, ax = new_figure(1, 1, size=(8, 5))
     shown = 0
     for i, name in enumerate(names):
+        share = shown + max(1, 10 // len(names))
         mine = quiet[quiet["monitor"] == i]
         for point in np.unique(trials["point"]):
             rows = trials[(trials["point"] == point) & (trials["monitor"] == i)]
@@ -120,7 +121,7 @@ def _roc(trials: np.ndarray, quiet: np.ndarray, limits: np.ndarray, axes: list[d
             n = rows["hit_n"].sum()
             missed = rows["roc_missed"].sum(axis=0) / max(n, 1)
             if (
-                shown >= 10
+                shown >= share
                 or not n
                 or not known.any()
                 or missed[known].max() < 1e-4
@@ -128,7 +129,6 @@ def _roc(trials: np.ndarray, quiet: np.ndarray, limits: np.ndarray, axes: list[d
             ):
                 continue
             shown += 1
-            mine = quiet[quiet["monitor"] == i]
             tests = mine["tests"].sum()
             p_fa = 1 - mine["roc_missed"].sum(axis=0) / tests if tests else ROC_P_FA
             label = ", ".join([name, *(f"{k.split('.')[-1]} {v}" for k, v in axes[point].items())])

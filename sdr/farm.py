@@ -486,8 +486,10 @@ def _point_text(r: dict[str, Any]) -> str:
     more = []
     if r["first_alarm_median_s"] is not None:
         more.append(f"first alarm {r['first_alarm_median_s']:.1f} s")
-    if r["undetected_code_error_m"] is not None and r["definition"] != "false_alarm":
-        more.append(f"undetected {r['undetected_code_error_m']:.1f} m raw, {r['undetected_smoothed_error_m']:.2f} m smoothed")  # fmt: skip
+    if r["lost_trials"]:
+        more.append(f"carrier lost in {r['lost_trials']} trials, left out of the errors")
+    if r["held_undetected_code_error_m"] is not None and r["definition"] != "false_alarm":
+        more.append(f"undetected {r['held_undetected_code_error_m']:.1f} m raw, {r['held_undetected_smoothed_error_m']:.2f} m smoothed")  # fmt: skip
     if "p_fa_approach" in r:
         low, high = r["p_fa_approach_ci"]
         more.append(f"per approach {r['p_fa_approach']:.2g} [{low:.2g}, {high:.2g}]")
