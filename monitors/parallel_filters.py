@@ -429,13 +429,10 @@ class ParallelBank:
         """One epoch: predict by (phi, qd), test, update, decide. ``extra_*`` are other aids (barometer, odometer)."""
         m, n = h.shape
         avail = np.ones(m, dtype=np.bool_) if avail is None else np.asarray(avail, dtype=np.bool_)
-        none = extra_z is None
-        extra = (
-            np.zeros((0, n)) if none else extra_h,
-            np.zeros(0) if none else extra_z,
-            np.zeros(0) if none else extra_var,
-        )
-        if not (np.all(var[avail] > 0) and np.all(extra[2] > 0)):
+        extra = extra_h, extra_z, extra_var
+        if extra_z is None:
+            extra = np.zeros((0, n)), np.zeros(0), np.zeros(0)
+        if not (np.all((var > 0) | ~avail) and np.all(extra[2] > 0)):
             raise ValueError("The parallel filters need measurement variances above zero.")
         use, test, period, phase = self._layout
         self._epoch += 1

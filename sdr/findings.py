@@ -76,7 +76,7 @@ class Alarms:
         count, _ = self._tested.pop(who, (0, rows))
         self._tested[who] = count + 1, rows["threshold"]
         over = rows["value"] >= rows["threshold"]
-        for row in rows[over] if over.any() else ():
+        for row in rows[over] if np.count_nonzero(over) else ():
             key = bytes(row["system"]), int(row["prn"])
             mine, t, value = self.found.setdefault(key, []), float(row["t_s"]), float(row["value"])
             if mine and t - mine[-1]["end_s"] <= self.gap_s:

@@ -163,7 +163,9 @@ class IntegrityLive:
 
     def _name_rivals(self, rows: np.ndarray | None) -> None:
         """Beside whom the parallel filters accuse, those that the ranges do not tell from it."""
-        for i in () if rows is None else np.flatnonzero(rows["value"] >= rows["threshold"]):
+        if rows is None:
+            return
+        for i in np.flatnonzero(rows["value"] >= rows["threshold"]):
             name = f"{rows['system'][i].decode()}{rows['prn'][i]:02d}"
             rows["rivals"][i] = " ".join(self._ranges.rivals(name)).encode()
 

@@ -24,6 +24,9 @@ RESPONSE = np.dtype(
 """What was asked of the next epoch, one row per satellite that anything was asked of."""
 
 
+NOBODY = np.zeros(0, REMEDY)
+
+
 class RespondSpec(BaseModel):
     """Section ``[receiver.respond]``: which monitor may act, and how. Everything is off by default.
 
@@ -125,6 +128,8 @@ class Response:
         """The remedy of the next epoch; None while nothing may act."""
         if self.spec.off:
             return None
+        if not (self.scale or self.shift or self.failed or self._until or self._only[0]):
+            return Remedy(NOBODY, dx, p, extra)
         out = self.out(t_s)
         own = {} if snap is None else dict(zip(snap.names, snap.own_m2))
         names = (set(self.scale) & set(own)) | set(self.shift) | out
