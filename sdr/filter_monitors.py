@@ -43,11 +43,12 @@ class FilterMonitors:
         """One epoch; rows into ``out``. Returns (dx, covariance) that the filter should take over, or None."""
         log = watch.log
         if log is None:
-            for name in ("innovation", "als", "parallel_filters"):
-                if name in self.alarms:
-                    self.alarms[name].lack(watch.reason)
-            return None, None
+            return self._lack(watch.reason)
         names, var = [str(n) for n, x in zip(log.names, log.seen) if x], self._variances(log)
+        if not np.all((var > 0) | ~log.seen[: log.slots]):
+            return self._lack("the filter's range variances are not all above zero")
+        if not math.isfinite(log.z.sum()):
+            return self._lack("the filter's innovations are not finite numbers")
         self._innovations(log, names, var, sample, t_s, out)
         dx, p = self._parallel(watch, log, names, var, sample, t_s, out)
         if p is not None and self._als is not None:
@@ -55,6 +56,12 @@ class FilterMonitors:
             return dx, p
         retuned = self._noise(watch, log, sample, t_s, out)
         return dx, p if retuned is None else retuned
+
+    def _lack(self, reason: str) -> tuple[None, None]:
+        for name in ("innovation", "als", "parallel_filters"):
+            if name in self.alarms:
+                self.alarms[name].lack(reason)
+        return None, None
 
     def moved(self, dx: np.ndarray) -> None:
         """The filter's state was corrected by somebody else."""

@@ -81,6 +81,8 @@ class RangeMonitors:
 
     def __call__(self, snap: Snapshot, sample: int, t_s: float, out: dict[str, np.ndarray]) -> None:
         """One epoch; rows into ``out``."""
+        if not math.isfinite(snap.residual_m.sum()):
+            return self.lack("the ranges of this epoch are not finite numbers")
         var = self.response.variance(snap.names, snap.own_m2)
         shift = self.response.shifts(snap.names)
         h = np.empty((len(snap.names), 5))
@@ -135,7 +137,7 @@ class RangeMonitors:
         bias and a ramp since the epoch that suits it best, at every fourth epoch of the memory. Sums since every epoch are
         sums from the end, of ramps sums of sums, and j^2 = 2 j (j + 1) / 2 - j.
         """
-        names = self._past[-1].names
+        names = self._past[-1].names if self._past else []
         if name not in names:
             return []
         wr, w = (_since(x) for x in np.stack([e.score(names) for e in self._past[-RECENT:]], axis=1))

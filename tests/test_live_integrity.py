@@ -300,6 +300,48 @@ def test_too_few_satellites_are_said_and_the_receiver_goes_on():
     assert np.all(np.isfinite(rows["protection"]["hpl_m"]))
 
 
+@pytest.mark.parametrize(
+    ("field", "value", "words"),
+    [
+        ("own", -1.0, "above zero"),
+        ("own", 0.0, "above zero"),
+        ("own", np.nan, "above zero"),
+        ("z", np.nan, "finite"),
+        ("z", np.inf, "finite"),
+        ("los", None, "singular"),
+    ],
+)
+def test_numbers_that_are_no_good_are_said_and_the_monitors_go_on(sky, field, value, words):
+    """One row, for twenty epochs, in what the monitors read: a sentence each, no warning, and as before afterwards."""
+    nav = NavigationSpec(**EKF).start(FS_HZ)
+    run = IntegritySpec(**ALL).start(RespondSpec(bias=True, exclude=["raim"]), FS_HZ)
+    run.watch(nav)
+    rng, eph, said = np.random.default_rng(1), ephemerides(sky), set()
+    for k in range(60):
+        observed = transmit(sky, T0 + k / RATE_HZ, SIGMA_M, 0.05, rng)
+        nav.update(observed, eph, sky.iono_utc, sky.iono_utc)
+        snap, bad = nav.snapshot, 20 <= k < 40
+        if bad and field == "los":
+            nav.snapshot = snap._replace(los=np.tile(snap.los[:1], (len(snap.los), 1)))
+        elif bad:
+            array = getattr(nav.log, field)
+            array[0] = value
+            mine = np.where(
+                np.arange(len(snap.names)) == 0, value, snap.own_m2 if field == "own" else snap.residual_m
+            )
+            nav.snapshot = snap._replace(**{"own_m2" if field == "own" else "residual_m": mine})
+        rows = run(int(observed["sample_index"][0]))
+        if bad:
+            said |= {a.reason for a in run.alarms.values() if a.reason}
+            assert "raim" not in rows and "bias_bank" not in rows
+    assert any(words in reason for reason in said)
+    assert (
+        np.isfinite(rows["bias_bank"]["value"][0])
+        and rows["raim"]["value"][0] < 1.0
+        and len(rows["innovation"]) == 10
+    )
+
+
 def test_no_position_is_said(sky):
     nav = NavigationSpec(**EKF).start(FS_HZ)
     run = IntegritySpec(**ALL).start(RespondSpec(bias=True), FS_HZ)
