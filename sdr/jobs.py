@@ -236,6 +236,9 @@ def _receive(
 ) -> dict[str, Any]:
     watched = side.source if side else Watched(source)
     receiver = side.primary if side else Receiver(spec, watched, sensors)
+    spectra = {"samples/spectrum": watched}
+    if receiver.mitigation:
+        receiver.source = spectra["mitigation/spectrum"] = Watched(receiver.mitigation)
     truth = _Truth(source, store)
     tally = _Tally()
     begin = time.perf_counter()
@@ -245,13 +248,8 @@ def _receive(
                 _store_outcome(store, receiver, outcome, tally)
                 if side:
                     side.follow(outcome)
-                store.append(
-                    "samples/spectrum",
-                    watched.rows(),
-                    fs_hz=source.fs_hz,
-                    if_hz=source.if_hz,
-                    every_s=EVERY_S,
-                )
+                for name, passed in spectra.items():
+                    store.append(name, passed.rows(), fs_hz=source.fs_hz, if_hz=source.if_hz, every_s=EVERY_S)
                 truth.up_to(outcome.n_end)
                 if store.due():
                     store.checkpoint()

@@ -46,6 +46,7 @@ def figure(
 def plot(results: Path, directory: Path | None = None) -> list[Path]:
     """Draw every figure that ``results`` has data for; returns their paths."""
     from sdr.integrity_figures import integrity, stanford
+    from sdr.truth_figures import echoes, motion
     from sdr.watch_figures import alarms, monitors
 
     directory = directory or Path(results).with_suffix("")
@@ -67,6 +68,8 @@ def plot(results: Path, directory: Path | None = None) -> list[Path]:
             _spectrum,
             _attack,
             _attacked_peak,
+            motion,
+            echoes,
             monitors,
             alarms,
             integrity,
@@ -299,18 +302,30 @@ def _spectrum(h5: h5py.File, channels: dict[str, h5py.Group], directory: Path) -
     freq_mhz = ((np.arange(rows.shape[1]) / rows.shape[1] - 0.5) * attrs["fs_hz"] - attrs["if_hz"]) * 1e-6
     t_s = np.arange(len(rows)) * attrs["every_s"]
     on = np.any([(t_s >= a) & (t_s < b) for a, b in attacks(h5)] or [np.zeros(len(t_s), bool)], axis=0)
+    parts = [("without jammer", rows[~on]), ("with jammer", rows[on])]
+    if "mitigation/spectrum" in h5:
+        cleaned = h5["mitigation/spectrum"][:]
+        parts.append(("with jammer, after the mitigation", cleaned[on[: len(cleaned)]]))
     path = directory / "spectrum.png"
     with figure(path, "Spectrum of the samples", rows=2, size=(9, 8)) as (ax, fall):
-        for mask, label in ((~on, "without jammer"), (on, "with jammer")):
-            if mask.any():
-                ax.plot(
-                    freq_mhz, 10 * np.log10(np.mean(10 ** (rows[mask] / 10), axis=0)), lw=0.9, label=label
-                )
+        for label, part in parts:
+            if len(part):
+                ax.plot(freq_mhz, 10 * np.log10(np.mean(10 ** (part / 10), axis=0)), lw=0.9, label=label)
         ax.set_ylabel("power per bin (dB re ADC level²)")
         ax.legend(fontsize=8)
         low, high = np.quantile(rows, [0.02, 0.999])
         image = fall.pcolormesh(freq_mhz, t_s, rows, vmin=low, vmax=high, shading="nearest", rasterized=True)
         fall.figure.colorbar(image, ax=[ax, fall], label="dB", shrink=0.5)
+        if "mitigation/tones" in h5 and len(h5["mitigation/tones"]):
+            tones = h5["mitigation/tones"][:]
+            fall.plot(
+                tones["freq_hz"] * 1e-6,
+                tones["sample_index"] / attrs["fs_hz"],
+                "r.",
+                ms=2,
+                label="tones found",
+            )
+            fall.legend(fontsize=8)
         fall.set(xlabel="offset from the carrier (MHz)", ylabel="time (s)")
     return path
 

@@ -37,7 +37,7 @@ from signals.modulation import SIGNALS
 from signals.multipath import EchoRun, MultipathSpec
 from signals.sky import Sky, SkySpec
 from signals.source import CELLS_PER_S, SyntheticSource
-from signals.trajectory import MotionSpec, Static
+from signals.trajectory import MotionSpec, Recorded, Static
 from tracking.acquisition import AcquisitionSpec
 from tracking.channel import TrackingSpec
 from tracking.mitigation import MitigationSpec
@@ -238,9 +238,7 @@ def _interferer(path: str, fs_hz: float) -> tuple[Callable[[int, int], np.ndarra
     """Random access to a recording as interferer: reader(n0, n) -> float32 (2, n) at zero frequency, and its length."""
     from sdr import iffile
 
-    shipped = Path(str(files("sdr") / "scenarios")) / Path(path).name
-    if not Path(path).exists() and path == shipped.name and shipped.exists():
-        path = str(shipped)  # a recording that comes with the built-in scenarios
+    path = _shipped(path)
     file = iffile.open_recording(path, iffile.declaration(path))
     if abs(file.fs_hz - fs_hz) > 1e-9 * fs_hz:
         raise ValueError(
@@ -261,6 +259,12 @@ def _interferer(path: str, fs_hz: float) -> tuple[Callable[[int, int], np.ndarra
         return np.stack([z.real, z.imag]).astype(np.float32)
 
     return read, file.n_samples
+
+
+def _shipped(path: str) -> str:
+    """The file of that name that comes with the built-in scenarios, unless there is one here."""
+    shipped = Path(str(files("sdr") / "scenarios")) / Path(path).name
+    return str(shipped) if not Path(path).exists() and path == shipped.name and shipped.exists() else path
 
 
 def _child(spec: Scenario, *part: int) -> np.random.SeedSequence:
@@ -345,7 +349,11 @@ def parse(text: str, origin: str = "scenario", overrides: Sequence[str] = ()) ->
     except tomllib.TOMLDecodeError as err:
         raise ValueError(f"{origin} is not valid TOML: {err}") from None
     _apply(table, overrides)
-    return validate(Scenario, table, origin)
+    spec = validate(Scenario, table, origin)
+    if isinstance(spec.motion, Recorded):
+        motion = spec.motion.model_copy(update={"path": _shipped(spec.motion.path)})
+        return spec.model_copy(update={"motion": motion})
+    return spec
 
 
 def validate(model: type[T], table: dict[str, Any], origin: str) -> T:

@@ -1,8 +1,12 @@
 """Every built-in scenario loads, starts and delivers samples; the schema refuses what it does not know."""
 
+from pathlib import Path
+
+import h5py
+import numpy as np
 import pytest
 
-from sdr import scenario
+from sdr import jobs, scenario
 
 
 @pytest.mark.parametrize("name", scenario.built_in())
@@ -35,3 +39,28 @@ def test_refusals_name_key_value_and_what_is_allowed(text, words):
     for word in ["x.toml", *words]:
         assert word in str(error.value)
     assert "\n" not in str(error.value).replace("TOML: ", "")
+
+
+@pytest.mark.parametrize(
+    ("name", "more", "figures"),
+    [
+        ("echoes", [], {"echoes"}),
+        ("manoeuvres", [], {"motion"}),
+        (
+            "cw-cancel",
+            ['jammer=[{kind="CW", jn0_dbhz=80.0, freq_hz=3e5, start_s=1.0}]'],
+            {"spectrum", "attack"},
+        ),
+    ],
+)
+def test_figures_show_what_a_scenario_has(tmp_path, name, more, figures):
+    """And the spectrum after a mitigation lacks the tone, 80 dB-Hz in a bin of 5 kHz over noise of 37, that it took out."""
+    path = tmp_path / "a.h5"
+    over = ["duration_s=3", "front_end.fs_hz=2.6e6", *more]
+    drawn = jobs.run(name, output=path, overrides=over, plots=True, quiet=True)["figures"]
+    assert figures <= {Path(f).stem for f in drawn}
+    with h5py.File(path) as h5:
+        if "mitigation/spectrum" in h5:
+            before, after = (h5[f"{part}/spectrum"][15:].mean(axis=0) for part in ("samples", "mitigation"))
+            assert before.max() - np.median(before) > 30.0
+            assert after.max() - np.median(after) < 6.0
