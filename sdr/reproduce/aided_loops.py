@@ -116,6 +116,8 @@ def _figure(out: Path, drawn) -> None:
         low.loglog(BANDWIDTHS_HZ, floor, "k--", label="thermal floor")
         top.set(title=f"amplitude {name}", ylabel="channels lost")
         low.set(xlabel="noise bandwidth of the FLL (Hz)", ylabel="velocity rms, 3-D (m/s)")
+        low.set_xticks(BANDWIDTHS_HZ, [f"{b:g}" for b in BANDWIDTHS_HZ])
+        low.set_xticks([], minor=True)
         top.legend(fontsize=8)
         low.legend(fontsize=8)
     save_figure(figure, out, "aided_loops")
