@@ -5,8 +5,6 @@ block to block. Over a cell of time the carrier phase is a cubic; its base table
 frequency moves too fast for that, and over long sweeps, phases are quadratic (`_quadratic`).
 """
 
-import math
-
 import numpy as np
 from numba import njit
 
@@ -18,6 +16,8 @@ from signals.kernels import (
     _carrier_bases,
     _cis,
     _float,
+    _half_turns,
+    _polynomials,
     _prefetch,
     _splitmix64,
     add_noise,
@@ -41,7 +41,6 @@ __all__ = [
     "add_jammers",
     "add_tone",
     "carriers",
-    "tone",
 ]
 
 TONE, SWEEP, CHIRP, PULSES, CODE, WIDE, NARROW = range(7)
@@ -56,7 +55,8 @@ JAMMER = np.dtype(
         ("period", "f8"),  # samples: of a sweep, of the slot of a pulse, of the code
         ("sweep", "f8"),  # width of the sweep, cycles per sample
         ("triangular", "i8"),
-        ("carrier", "f8"),  # CHIRP: the carrier in the table, cycles per sample
+        ("held", "i8"),  # CHIRP: 1 if the table holds the carrier, and that, cycles per sample
+        ("carrier", "f8"),
         ("width", "f8"),  # samples: of a rectangle; standard deviation of a Gaussian pulse
         ("pair", "f8"),  # samples between the pulses of a pair; 0: single pulses
         ("gaussian", "i8"),
@@ -64,21 +64,23 @@ JAMMER = np.dtype(
         ("table", "i8"),  # offset in the flat buffer of codes (CODE), waves (CHIRP) or taps (NARROW)
         ("rows", "i8"),
         ("columns", "i8"),
-        ("phases", "i8"),  # NARROW: outputs of the filter per lattice point, 1 or 2
+        ("phases", "i8"),  # NARROW: outputs of the filter per lattice point, 1 to 3
         ("step", "i8"),  # samples between these, a power of two
     ]
 )
 """What is constant about a jammer."""
 
-N_TAPS = 12
+N_TAPS = 9
 """Lattice points under the interpolation filter of narrow-band noise."""
-LANES = 64
-"""Samples under one table of a quadratic phase."""
+GROUP = 8
+"""Lattice points that are made at once."""
+LANES = 32
+"""Samples under one table of a quadratic phase, which is a row of a block."""
 STEADY = 1e-5
 """Cycles by which a base table may miss the carrier at its edges."""
 WAVE_SCALE = 32767.0
 """Unit amplitude in the int16 tables of waves."""
-WORK = 16, BLOCK + 64
+WORK = 16, BLOCK + 128
 """Shape of the scratch rows that the caller provides."""
 DOUBLINGS = 64
 """Steps up to this are crossed by doubling, longer ones by one doubling and cubics."""
@@ -98,48 +100,119 @@ def _turns(cycles):
     return _U(np.int64(np.floor((cycles - np.floor(cycles)) * _TURN + 0.5)) & 0xFFFFFFFF)
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST)
-def _piece(out_i, out_q, k0, n, p32, f32, h32):
-    """exp(2 pi i (p + f j + h j^2)), j < n, into out[k0 + j].
+# -- phases that are quadratic over a block --------------------------------------------------------------------------
 
-    Polynomials of sine and cosine of half the angle: those of ``signals.kernels.noise_span``.
-    """
+# With j = LANES a + b, and (a', b') = (LANES a - BLOCK / 2, b - (LANES - 1) / 2), the phase p + f j + h j^2 is a sum of one
+# of a, one of b and 2 h a' b': a scalar per a times a table over b, which turns from a to a + 1 where the product counts.
+# Tables lie in one flat array: W over b, the W before it, 2 cos of its turn, and the scalars.
+_W, _BEFORE, _SPIN, _ROW = 0, 2 * LANES, 4 * LANES, 6 * LANES
+
+
+@njit(cache=True, nogil=True, fastmath=_FAST)
+def _piece(t, at, n, p, f, h):
+    """cos and sin of 2 pi (p + f j + h j^2), j < n, into t[at + j] and t[at + n + j]; error below 6e-5 for n <= 64."""
+    p32, f32, h32, o = _turns(p), _turns(f), _turns(h), _Q(at)
+    _, sine, cosine = _polynomials()
     for m in range(n):
-        j, k = _U(m), _Q(m) + _Q(k0)
+        j, k = _U(m), _Q(m)
         phase = _U(p32 + j * _U(f32 + _U(j * h32)))
-        a = _F(_I(phase)) * _F(2.0**-32)
-        a2 = a * a
-        s = a * (_F(3.14158203) + a2 * (_F(-5.16714292) + a2 * (_F(2.5419) + a2 * _F(-0.554638688))))
-        c = _F(0.999999953) + a2 * (
-            _F(-4.93479286) + a2 * (_F(4.05841194) + a2 * (_F(-1.33188034) + a2 * _F(0.219697149)))
-        )
-        out_i[k] = _F(1) - _F(2) * s * s
-        out_q[k] = _F(2) * s * c
+        s, c = _half_turns(_F(_I(phase)) * _F(2.0**-32), sine, cosine)
+        t[o + k] = _F(1) - _F(2) * s * s
+        t[o + k + _Q(n)] = _F(2) * s * c
+
+
+@njit(cache=True, nogil=True, fastmath=_FAST)
+def _turning(t):
+    """W of the row before from W and its turn; of the turn 2 cos is kept: W' = 2 cos W - W''."""
+    for m in range(LANES):
+        k = _Q(m)
+        x, y, c, s = t[k], t[k + _Q(LANES)], t[k + _Q(_SPIN)], t[k + _Q(_SPIN + LANES)]
+        t[k + _Q(_BEFORE)] = x * c + y * s
+        t[k + _Q(_BEFORE + LANES)] = y * c - x * s
+        t[k + _Q(_SPIN)] = c + c
+
+
+@njit(cache=True, nogil=True, forceinline=True)
+def _rows(t, a, level):
+    """The scalars of four rows from a on."""
+    re, im = _ROW + a, _ROW + BLOCK // LANES + a
+    return (
+        (level * t[re], level * t[re + 1], level * t[re + 2], level * t[re + 3]),
+        (level * t[im], level * t[im + 1], level * t[im + 2], level * t[im + 3]),
+    )
+
+
+@njit(cache=True, nogil=True, fastmath=_FAST, forceinline=True)
+def _put(out_i, out_q, k, re, im, x, y):
+    out_i[k] += re * x - im * y
+    out_q[k] += re * y + im * x
+
+
+@njit(cache=True, nogil=True, fastmath=_FAST)
+def _add_still(out_i, out_q, t, a, level):
+    """Add four rows of a W that does not turn."""
+    o = _Q(a * LANES)
+    re, im = _rows(t, a, level)
+    for m in range(LANES):
+        k = _Q(m)
+        x, y = t[k], t[k + _Q(LANES)]
+        _put(out_i, out_q, o + k, re[0], im[0], x, y)
+        _put(out_i, out_q, o + k + _Q(LANES), re[1], im[1], x, y)
+        _put(out_i, out_q, o + k + _Q(2 * LANES), re[2], im[2], x, y)
+        _put(out_i, out_q, o + k + _Q(3 * LANES), re[3], im[3], x, y)
+
+
+@njit(cache=True, nogil=True, fastmath=_FAST)
+def _add_turning(out_i, out_q, t, a, level):
+    """Add four rows and turn W past them."""
+    o = _Q(a * LANES)
+    re, im = _rows(t, a, level)
+    for m in range(LANES):
+        k = _Q(m)
+        x, y, f = t[k], t[k + _Q(LANES)], t[k + _Q(_SPIN)]
+        u, v = t[k + _Q(_BEFORE)], t[k + _Q(_BEFORE + LANES)]
+        _put(out_i, out_q, o + k, re[0], im[0], x, y)
+        u, v = f * x - u, f * y - v
+        _put(out_i, out_q, o + k + _Q(LANES), re[1], im[1], u, v)
+        x, y = f * u - x, f * v - y
+        _put(out_i, out_q, o + k + _Q(2 * LANES), re[2], im[2], x, y)
+        u, v = f * x - u, f * y - v
+        _put(out_i, out_q, o + k + _Q(3 * LANES), re[3], im[3], u, v)
+        t[k + _Q(_BEFORE)], t[k + _Q(_BEFORE + LANES)] = u, v
+        t[k], t[k + _Q(LANES)] = f * u - x, f * v - y
 
 
 @njit(cache=True, nogil=True)
-def tone(out_i, out_q, k0, k1, p, f, h):
-    """exp(2 pi i (p + f j + h j^2)), j = k - k0, for k0 <= k < k1; error below 6e-5.
-
-    In pieces of SUB, over which the rounding of h to 2^-32 moves the phase by 8e-6 cycles at most.
-    """
-    for begin in range(0, k1 - k0, SUB):
-        n = min(SUB, k1 - k0 - begin)
-        here = p + begin * (f + h * begin)
-        _piece(out_i, out_q, k0 + begin, n, _turns(here), _turns(f + 2.0 * h * begin), _turns(h))
+def _quadratic(out_i, out_q, p, f, h, level, at_level, t):
+    """out[j] += level exp(2 pi i (p + f j + h j^2)), j < BLOCK; error below 6e-5 for h up to 1e-4."""
+    still = abs(h) * (BLOCK * LANES // 2) < STEADY
+    tilt, last = BLOCK * h if still else 0.0, len(level) - 1
+    _piece(t, _W, LANES, 0.0, f + tilt, h)
+    row = BLOCK // LANES
+    _piece(t, _ROW, row, p - 0.5 * (LANES - 1) * tilt, LANES * (f + (LANES - 1) * h), LANES * LANES * h)
+    if not still:
+        _piece(t, _SPIN, LANES, -LANES * (LANES - 1) * h, 2.0 * LANES * h, 0.0)
+        _turning(t)
+    for a in range(0, row, 4):
+        now = level[min(at_level + a * LANES // SUB, last)]
+        if still:
+            _add_still(out_i, out_q, t, a, now)
+        else:
+            _add_turning(out_i, out_q, t, a, now)
 
 
 @njit(cache=True, nogil=True)
 def add_tone(iq, n0, freq, level):
     """iq += level exp(2 pi i freq n), n = n0, n0 + 1, ..: float32 (2, n), ``freq`` in cycles per sample."""
-    c, s = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
+    work, one = np.empty((3, BLOCK), np.float32), np.ones(1, np.float32)
     n1 = n0 + iq.shape[1]
     for block in range(n0 // BLOCK, (n1 - 1) // BLOCK + 1):
         first = block * BLOCK
-        tone(c, s, 0, BLOCK, freq * first, freq, 0.0)
+        work[:2] = 0
+        _quadratic(work[0], work[1], freq * first, freq, 0.0, one, 0, work[2])
         for n in range(max(n0, first), min(n1, first + BLOCK)):
-            iq[0, n - n0] += level * c[n - first]
-            iq[1, n - n0] += level * s[n - first]
+            iq[0, n - n0] += level * work[0, n - first]
+            iq[1, n - n0] += level * work[1, n - first]
 
 
 # -- carriers --------------------------------------------------------------------------------------------------------
@@ -210,68 +283,6 @@ def _add_turned(out_i, out_q, x_i, x_q, at, base, at_base, rot_i, rot_q, at_rot)
 # -- sweeps ----------------------------------------------------------------------------------------------------------
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST)
-def _turn_on(out_i, out_q, k0, n, w_i, w_q, e_i, e_q, re, im):
-    """out[k0 + j] += (re + i im) w[j], then w[j] *= e[j], j < n."""
-    o = _Q(k0)
-    for m in range(n):
-        k = _Q(m)
-        x, y, c, s = w_i[k], w_q[k], e_i[k], e_q[k]
-        out_i[o + k] += re * x - im * y
-        out_q[o + k] += re * y + im * x
-        w_i[k] = x * c - y * s
-        w_q[k] = x * s + y * c
-
-
-@njit(cache=True, nogil=True, fastmath=_FAST)
-def _turn_four(out_i, out_q, k0, w_i, w_q, e_i, e_q, r_i, r_q, a, level):
-    """Four turns of it at once, which read and write the table once."""
-    o = _Q(k0)
-    c0, c1, c2, c3 = level * r_i[a], level * r_i[a + 1], level * r_i[a + 2], level * r_i[a + 3]
-    s0, s1, s2, s3 = level * r_q[a], level * r_q[a + 1], level * r_q[a + 2], level * r_q[a + 3]
-    for m in range(LANES):
-        k = _Q(m)
-        x, y, c, s = w_i[k], w_q[k], e_i[k], e_q[k]
-        out_i[o + k] += c0 * x - s0 * y
-        out_q[o + k] += c0 * y + s0 * x
-        x, y = x * c - y * s, x * s + y * c
-        out_i[o + k + _Q(LANES)] += c1 * x - s1 * y
-        out_q[o + k + _Q(LANES)] += c1 * y + s1 * x
-        x, y = x * c - y * s, x * s + y * c
-        out_i[o + k + _Q(2 * LANES)] += c2 * x - s2 * y
-        out_q[o + k + _Q(2 * LANES)] += c2 * y + s2 * x
-        x, y = x * c - y * s, x * s + y * c
-        out_i[o + k + _Q(3 * LANES)] += c3 * x - s3 * y
-        out_q[o + k + _Q(3 * LANES)] += c3 * y + s3 * x
-        w_i[k] = x * c - y * s
-        w_q[k] = x * s + y * c
-
-
-@njit(cache=True, nogil=True)
-def _quadratic(out_i, out_q, k0, k1, p, f, h, level, at_level, work):
-    """out[k0 + j] += level exp(2 pi i (p + f j + h j^2)), k0 + j < k1 <= k0 + BLOCK.
-
-    With j = LANES a + b the phase is (p + LANES f a + LANES^2 h a^2) + (f b + h b^2) + 2 LANES h a b: a scalar per a, a
-    table over b, and a factor that turns the table from a to a + 1.
-    """
-    w_i, w_q, e_i, e_q, r_i, r_q = work[0], work[1], work[2], work[3], work[4], work[5]
-    n, last = k1 - k0, len(level) - 1
-    _piece(w_i, w_q, 0, min(LANES, n), _U(0), _turns(f), _turns(h))
-    _piece(e_i, e_q, 0, min(LANES, n), _U(0), _turns(2.0 * LANES * h), _U(0))
-    _piece(r_i, r_q, 0, 16, _turns(p), _turns(LANES * f), _turns(LANES * LANES * h))
-    a = 0
-    while a * LANES < n:
-        k = k0 + a * LANES
-        now = level[min(at_level + k // SUB, last)]
-        if n - a * LANES >= SUB:
-            _turn_four(out_i, out_q, k, w_i, w_q, e_i, e_q, r_i, r_q, a, now)
-            a += SUB // LANES
-        else:
-            here = min(LANES, n - a * LANES)
-            _turn_on(out_i, out_q, k, here, w_i, w_q, e_i, e_q, now * r_i[a], now * r_q[a])
-            a += 1
-
-
 @njit(cache=True, nogil=True, forceinline=True)
 def _sweep(out_i, out_q, first, jammer, p, f, h, level, at_level, work):
     """Saw-tooth or triangle about the carrier: -B/2 .. B/2 in a period, the phase continuous."""
@@ -284,12 +295,18 @@ def _sweep(out_i, out_q, first, jammer, p, f, h, level, at_level, work):
             turn += 1.0
             last = np.int64(np.ceil((turn + 1.0) * period))
         end = min(last - first, BLOCK)
-        tau = max(n - turn * period, 0.0)
+        tau = first - turn * period
         sign = -1.0 if jammer.triangular and np.int64(turn) % 2 == 1 else 1.0
         rate, edge = sign * jammer.sweep / period, 0.5 * sign * jammer.sweep
-        here = p + k * (f + h * k) + tau * (0.5 * rate * tau - edge)
-        freq = f + 2.0 * h * k + rate * tau - edge
-        _quadratic(out_i, out_q, k, end, here, freq, h + 0.5 * rate, level, at_level, work)
+        here, freq, bend = p + tau * (0.5 * rate * tau - edge), f + rate * tau - edge, h + 0.5 * rate
+        if end - k == BLOCK:
+            _quadratic(out_i, out_q, here, freq, bend, level, at_level, work[0])
+        else:
+            work[1:3] = 0
+            _quadratic(work[1], work[2], here, freq, bend, level, at_level, work[0])
+            for j in range(k, end):
+                out_i[j] += work[1, j]
+                out_q[j] += work[2, j]
         k = end
 
 
@@ -309,7 +326,7 @@ def _add_wave(out_i, out_q, waves, at, size, level, at_level, re, im):
 
 @njit(cache=True, nogil=True, forceinline=True)
 def _chirp(out_i, out_q, first, jammer, p, level, at_level, waves):
-    """Sweeps from a table whose rows begin 1 / rows of a sample apart and hold the carrier as well.
+    """Sweeps from a table whose rows begin 1 / rows of a sample apart and may hold the carrier as well.
 
     In the middle of the block the phase is exact where the sweeps are longer than a block.
     """
@@ -415,54 +432,78 @@ def _code(out_i, out_q, first, jammer, base, at_base, rot_i, rot_q, at_rot, code
 # -- noise -----------------------------------------------------------------------------------------------------------
 
 
-@njit(cache=True, nogil=True, forceinline=True)
-def _white(out_i, out_q, first, jammer, level, at_level, hash1, hash2):
-    """White Gaussian noise of power level^2, in I and Q together."""
-    block, half, end = _Q(first // BLOCK), _F(math.sqrt(0.5)), BLOCK if len(level) == 1 else SUB
-    for begin in range(0, BLOCK, end):
-        a = half * level[min(at_level + begin // SUB, len(level) - 1)]
-        add_noise(out_i, out_q, hash1, hash2, jammer.seed, block, a, begin, begin + end)
-
-
 @njit(cache=True, nogil=True)
 def _lattice(out_i, out_q, begin, n, hash1, hash2, seed):
-    """Points begin .. begin + n - 1 of an endless row of white Gaussian numbers of unit power, n <= BLOCK + 64."""
-    done = 0
+    """Points begin .. begin + n - 1, n <= BLOCK, of an endless row of white Gaussian numbers of unit power; where they
+    begin in ``out``: whole groups of GROUP points are made, so that no vector is left half empty.
+    """
+    lead = begin % GROUP
+    at, done, n = begin - lead, 0, (n + lead + GROUP - 1) // GROUP * GROUP
     while done < n:
-        block, k = (begin + done) // BLOCK, (begin + done) % BLOCK
+        block, k = (at + done) // BLOCK, (at + done) % BLOCK
         here = min(n - done, BLOCK - k)
-        noise_span(out_i, out_q, done, hash1, hash2, seed, _Q(block), k, here, _F(math.sqrt(0.5)))
+        noise_span(out_i, out_q, done, hash1, hash2, seed, _Q(block), k, here, _F(0.5))
         done += here
+    return lead
+
+
+@njit(cache=True, nogil=True, fastmath=_FAST, forceinline=True)
+def _folded(x, k):
+    """The middle of N_TAPS points with the sums of the pairs about it, inner ones first, and their differences."""
+    c = x[k + _Q(4)]
+    a1, a2, a3, a4 = x[k + _Q(3)], x[k + _Q(2)], x[k + _Q(1)], x[k]
+    b1, b2, b3, b4 = x[k + _Q(5)], x[k + _Q(6)], x[k + _Q(7)], x[k + _Q(8)]
+    return (c, a1 + b1, a2 + b2, a3 + b3, a4 + b4), (b1 - a1, b2 - a2, b3 - a3, b4 - a4)
+
+
+@njit(cache=True, nogil=True, fastmath=_FAST, forceinline=True)
+def _even(e, s):
+    return e[0] * s[0] + e[1] * s[1] + e[2] * s[2] + e[3] * s[3] + e[4] * s[4]
+
+
+@njit(cache=True, nogil=True, fastmath=_FAST, forceinline=True)
+def _odd(o, d):
+    return o[0] * d[0] + o[1] * d[1] + o[2] * d[2] + o[3] * d[3]
+
+
+@njit(cache=True, nogil=True, fastmath=_FAST, forceinline=True)
+def _taps(taps, t):
+    """Those of `_even` and of `_odd`, which begin at t and t + 6."""
+    even = taps[t], taps[t + 1], taps[t + 2], taps[t + 3], taps[t + 4]
+    return even, (taps[t + 6], taps[t + 7], taps[t + 8], taps[t + 9])
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST)
-def _six(out, x, at, taps, tap, n):
-    """out[m] += sum over t < 6 of taps[tap + t] x[at + m + t], m < n."""
-    t0, t1, t2 = taps[tap], taps[tap + 1], taps[tap + 2]
-    t3, t4, t5 = taps[tap + 3], taps[tap + 4], taps[tap + 5]
+def _one(out, x, at, taps, t, n):
+    """One output at every point."""
+    e, _ = _taps(taps, t)
     for m in range(n):
-        k = _Q(m)
-        j = _Q(at) + k
-        sums = t0 * x[j] + t1 * x[j + _Q(1)] + t2 * x[j + _Q(2)]
-        sums += t3 * x[j + _Q(3)] + t4 * x[j + _Q(4)] + t5 * x[j + _Q(5)]
-        out[k] += sums
-
-
-@njit(cache=True, nogil=True)
-def _filter(out, x, taps, tap, n):
-    """out[m] = sum over t < N_TAPS of taps[tap + t] x[m + t], m < n: six at a time, which stay in registers."""
-    out[:n] = 0
-    for t in range(0, N_TAPS, 6):
-        _six(out, x, t, taps, tap + t, n)
+        s, _ = _folded(x, _Q(at) + _Q(m))
+        out[_Q(m)] = _even(e, s)
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST)
-def _interleave(out, even, odd, n):
-    """out[2 m] = even[m], out[2 m + 1] = odd[m], m < n."""
+def _two(out, x, at, taps, t, n):
+    """Outputs a quarter before and after every point, by filters that are each other's mirror images."""
+    e, o = _taps(taps, t)
     for m in range(n):
-        k = _Q(m)
-        out[_Q(2) * k] = even[k]
-        out[_Q(2) * k + _Q(1)] = odd[k]
+        s, d = _folded(x, _Q(at) + _Q(m))
+        u, v = _even(e, s), _odd(o, d)
+        out[_Q(2) * _Q(m)] = u - v
+        out[_Q(2) * _Q(m) + _Q(1)] = u + v
+
+
+@njit(cache=True, nogil=True, fastmath=_FAST)
+def _three(out, x, at, taps, t, n):
+    """Outputs a third before, at and a third after every point."""
+    e, o = _taps(taps, t)
+    c = taps[t + 10], taps[t + 11], taps[t + 12], taps[t + 13], taps[t + 14]
+    for m in range(n):
+        s, d = _folded(x, _Q(at) + _Q(m))
+        u, v = _even(e, s), _odd(o, d)
+        out[_Q(3) * _Q(m)] = u - v
+        out[_Q(3) * _Q(m) + _Q(1)] = _even(c, s)
+        out[_Q(3) * _Q(m) + _Q(2)] = u + v
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST)
@@ -498,17 +539,17 @@ def _cubics(out, x, at, shift, step):
 
 
 @njit(cache=True, nogil=True, forceinline=True)
-def _finer(work, x, a, jammer, first, at, n, taps):
+def _finer(work, x, at_x, a, jammer, first, at, n, taps):
     """Lattice points in row x -> the block's samples: the row (a or a + 1) and the place where they begin."""
     step = jammer.step
     if jammer.phases == 1:
-        _filter(work[a], work[x], taps, jammer.table, n)
-        return a, 0
-    _filter(work[2], work[x], taps, jammer.table, n)
-    _filter(work[3], work[x], taps, jammer.table + N_TAPS, n)
-    _interleave(work[a], work[2], work[3], n)
+        _one(work[a], work[x], at_x, taps, jammer.table, n)
+    elif jammer.phases == 2:
+        _two(work[a], work[x], at_x, taps, jammer.table, n)
+    else:
+        _three(work[a], work[x], at_x, taps, jammer.table, n)
     if step == 1:
-        return a, 0
+        return a, at
     if step > DOUBLINGS:
         _double(work[a + 1], work[a], at, BLOCK // step + 12)
         fine = step // 2
@@ -524,16 +565,14 @@ def _finer(work, x, a, jammer, first, at, n, taps):
 @njit(cache=True, nogil=True, forceinline=True)
 def _narrow(out_i, out_q, first, jammer, taps, base, at_base, rot_i, rot_q, at_rot, work, hash1, hash2):
     """A band of noise about the carrier: lattice, polyphase filter, doublings, and cubics where that is not enough."""
-    phases, step = jammer.phases, jammer.step
-    m0, at, n = first // phases, 0, BLOCK // phases
-    if step > 1:  # four outputs of the filter before the block's own and eight after them
-        j0 = first // step
-        m0, at = j0 // 2 - 2, j0 % 2
-        n = (at + BLOCK // step + 14) // 2
-        n = (n + 7) // 8 * 8
-    _lattice(work[0], work[1], m0 - N_TAPS // 2 + 1, n + N_TAPS, hash1, hash2, jammer.seed)
-    i, at_i = _finer(work, 0, 4, jammer, first, at, n, taps)
-    q, _ = _finer(work, 1, 6, jammer, first, at, n, taps)
+    phases, begin, n = jammer.phases, first, BLOCK
+    if jammer.step > 1:  # four outputs of the filter before the block's own and eight after them
+        begin, n = first // jammer.step - 4, BLOCK // jammer.step + 14
+    m0, at = begin // phases, begin % phases
+    n = (n + at + 8 * phases - 1) // (8 * phases) * 8
+    at_x = _lattice(work[0], work[1], m0 - N_TAPS // 2, n + N_TAPS - 1, hash1, hash2, jammer.seed)
+    i, at_i = _finer(work, 0, at_x, 2, jammer, first, at, n, taps)
+    q, _ = _finer(work, 1, at_x, 4, jammer, first, at, n, taps)
     _add_turned(out_i, out_q, work[i], work[q], at_i, base, at_base, rot_i, rot_q, at_rot)
 
 
@@ -566,19 +605,31 @@ def _envelope(
         _narrow(out_i, out_q, first, jammer, taps, base, at_base, rot_i, rot_q, at_rot, work, hash1, hash2)
 
 
-@njit(cache=True, nogil=True, forceinline=True)
-def _moving(
-    out_i, out_q, first, jammer, base, at_base, rot_i, rot_q, at_rot, codes, taps, p, f, h, work, hash1, hash2
-):
-    """An envelope under a carrier whose frequency moves fast."""
-    x_i, x_q, c, s = work[10], work[11], work[12], work[13]
-    x_i[:BLOCK] = 0
-    x_q[:BLOCK] = 0
-    _envelope(x_i, x_q, first, jammer, base, at_base, rot_i, rot_q, at_rot, codes, taps, work, hash1, hash2)
-    tone(c, s, 0, BLOCK, p, f, h)
-    for k in range(BLOCK):
+@njit(cache=True, nogil=True, fastmath=_FAST)
+def _add_product(out_i, out_q, x_i, x_q, c, s):
+    """out += x (c + i s) over a block."""
+    for m in range(BLOCK):
+        k = _Q(m)
         out_i[k] += x_i[k] * c[k] - x_q[k] * s[k]
         out_q[k] += x_i[k] * s[k] + x_q[k] * c[k]
+
+
+@njit(cache=True, nogil=True, forceinline=True)
+def _moving(
+    out_i, out_q, first, jammer, base, at_base, rot_i, rot_q, at_rot, codes, waves, taps, p, f, h, level, sub, work, hash1, hash2
+):  # fmt: skip
+    """An envelope under a carrier whose frequency moves fast, or that its table does not hold."""
+    work[8:13] = 0
+    x_i, x_q, c, s, one = work[8], work[9], work[10], work[11], work[12, :1]
+    one[0] = 1
+    if jammer.kind == CHIRP:
+        _chirp(x_i, x_q, first, jammer, 0.0, level, sub, waves)
+    else:
+        _envelope(
+            x_i, x_q, first, jammer, base, at_base, rot_i, rot_q, at_rot, codes, taps, work, hash1, hash2
+        )
+    _quadratic(c, s, p, f, h, one, 0, work[13])
+    _add_product(out_i, out_q, x_i, x_q, c, s)
 
 
 @njit(cache=True, nogil=True, forceinline=True)
@@ -607,7 +658,7 @@ def _jammer(
     jammer, sub = jammers[j], b * (BLOCK // SUB)
     at_base, at_rot = 2 * SUB * j, len(rot_i) // len(jammers) * j + sub
     if jammer.kind == WIDE:
-        _white(out_i, out_q, first, jammer, level[j], sub, hash1, hash2)
+        add_noise(out_i, out_q, hash1, hash2, jammer.seed, _Q(first // BLOCK), level[j], sub)
         return
     moves = _moves(carrier, j, n_cell)
     if not moves and jammer.kind != SWEEP and jammer.kind != CHIRP:
@@ -618,13 +669,13 @@ def _jammer(
     p, f, h = _at(carrier, j, x, n_cell)
     if jammer.kind == SWEEP:
         _sweep(out_i, out_q, first, jammer, p, f, h, level[j], sub, work)
-    elif jammer.kind == CHIRP:
+    elif jammer.kind == CHIRP and jammer.held:
         _chirp(out_i, out_q, first, jammer, p, level[j], sub, waves)
     elif jammer.kind == TONE:
-        _quadratic(out_i, out_q, 0, BLOCK, p, f, h, level[j], sub, work)
+        _quadratic(out_i, out_q, p, f, h, level[j], sub, work[0])
     else:
         _moving(
-            out_i, out_q, first, jammer, base, at_base, rot_i, rot_q, at_rot, codes, taps, p, f, h, work, hash1, hash2
+            out_i, out_q, first, jammer, base, at_base, rot_i, rot_q, at_rot, codes, waves, taps, p, f, h, level[j], sub, work, hash1, hash2
         )  # fmt: skip
 
 

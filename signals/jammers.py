@@ -50,7 +50,8 @@ _MAX_LINE = 8
 _PULSE_S = 1.0 / math.sqrt(4.5e11)
 """Width of a DME pulse exp(-alpha t^2 / 2), alpha = 4.5e11 / s^2 (RTCA DO-292; 3.5 us between half-amplitude
 points)."""
-_SHORT_SWEEP = 1 << 17
+_SHORT_SWEEP = 1 << 14
+"""Samples up to which a sweep comes from a table: beyond, blocks with a turn, which cost twice, are rare."""
 _SWEEP_TABLE = 1 << 20
 """Values in the table of a short sweep: 4 MB."""
 _CODE_CHIPS = 40_920
@@ -254,8 +255,8 @@ class CW(_Jammer):
 class Chirp(_Jammer):
     """A tone swept over ``sweep_hz`` about its centre in ``sweep_s``: up and again (sawtooth), or up and down.
 
-    Sweeps of up to 131,072 samples come from a table whose rows begin 1/P of a sample apart, with P (M + 1032) up to 2^20
-    and P up to 256: an error of 2e-3 to 6e-3 rad at most, -44 dB. Longer ones, and those whose centre moves, are exact.
+    Sweeps of up to 16,384 samples come from a table whose rows begin 1/P of a sample apart, with P (M + 1032) up to 2^20
+    and P up to 256: an error of 2e-3 to 6e-3 rad at most, -44 dB. Longer ones are exact.
     """
 
     kind: Literal["Chirp"] = "Chirp"
@@ -275,11 +276,12 @@ class Chirp(_Jammer):
         """See `_Jammer.envelope`."""
         length, sweep, two = self.sweep_s * fs_hz, self.sweep_hz / fs_hz, self.shape == "triangular"
         fields = {"period": length, "sweep": sweep, "triangular": two}
-        if length > _SHORT_SWEEP or context["carrier_hz"] is None:
+        if length > _SHORT_SWEEP:
             return Envelope(kernels.SWEEP, fields=fields)
-        carrier = context["carrier_hz"] / fs_hz
+        held = context["carrier_hz"] is not None
+        carrier = context["carrier_hz"] / fs_hz if held else 0.0
         wave = _sweep_table(length, sweep, two, carrier)
-        fields |= {"carrier": carrier, "rows": wave.shape[1], "columns": wave.shape[2]}
+        fields |= {"held": held, "carrier": carrier, "rows": wave.shape[1], "columns": wave.shape[2]}
         return Envelope(kernels.CHIRP, fields=fields, waves=wave.ravel())
 
 
@@ -368,19 +370,22 @@ class Narrowband(_Jammer):
 
     def lattice(self, fs_hz: float) -> tuple[int, int]:
         """(phases of the filter, samples between its outputs); their product is D."""
-        spacing = max(int(math.log2(max(fs_hz / (1.2 * self.bandwidth_hz), 1.0))), 0)
-        return 2 ** min(spacing, 1), 2 ** max(spacing - 1, 0)
+        spacing = max(fs_hz / (1.2 * self.bandwidth_hz), 1.0)
+        octave = int(math.log2(spacing))
+        if octave and spacing >= 1.5 * 2**octave:
+            return 3, 2 ** (octave - 1)
+        return 2 ** min(octave, 1), 2 ** max(octave - 1, 0)
 
     def response(self, fs_hz: float) -> np.ndarray:
         """Impulse response on the grid of the filter's outputs, N_TAPS * phases: unit mean power after the cubics."""
         phases, step = self.lattice(fs_hz)
         n = kernels.N_TAPS * phases
-        u = (np.arange(n) - n // 2) / phases
+        u = (np.arange(n) - 0.5 * (n - 1)) / phases
         wanted = cut = self.bandwidth_hz / fs_hz * phases * step
         for _ in range(
             4
         ):  # the window's skirts take power from the band: widen it until its noise bandwidth is right
-            h = np.sinc(cut * u) * np.kaiser(n + 1, 4.5)[:n]
+            h = np.sinc(cut * u) * np.kaiser(n, 4.5)
             cut = min(cut * wanted * np.sum(h) ** 2 / (np.sum(h**2) * phases), 1.0)
         fine, steps = finer(h, step)
         return h * math.sqrt(phases * steps / np.sum(fine**2))
@@ -388,11 +393,12 @@ class Narrowband(_Jammer):
     def envelope(self, fs_hz, seed, context):
         """See `_Jammer.envelope`."""
         phases, step = self.lattice(fs_hz)
-        h = self.response(fs_hz)
-        # Output j takes points j // phases - T / 2 + 1 .. + T / 2: tap t weighs the point t - T / 2 + 1.
-        place = np.arange(phases)[:, None] + np.arange(kernels.N_TAPS)[::-1] * phases
+        # An output u after a point c weighs the point c + j by h(u - j), that at -u its mirror image.
+        h, half = self.response(fs_hz).reshape(kernels.N_TAPS, phases), kernels.N_TAPS // 2
+        after, before = h[half:, -1], h[half::-1, -1]
+        taps = np.stack([(before + after) / 2, (before - after) / 2, h[half:, phases // 2]])
         fields = {"phases": phases, "step": step}
-        return Envelope(kernels.NARROW, fields=fields, taps=h[place].ravel().astype(np.float32))
+        return Envelope(kernels.NARROW, fields=fields, taps=taps.ravel().astype(np.float32))
 
 
 def finer(h: np.ndarray, step: int) -> tuple[np.ndarray, int]:

@@ -90,6 +90,19 @@ def _mix(typingctx, x, key, shift, factor):
 
 
 @intrinsic
+def _held(typingctx, x):
+    """A float32 that the compiler takes for a variable: a loop then keeps it as a vector, in a register or on the stack,
+    instead of fetching the constant anew every time."""
+
+    def codegen(ctx, b, sig, args):
+        i32 = ir.IntType(32)
+        bits = b.asm(ir.FunctionType(i32, [i32]), "", "=r,0", [b.bitcast(args[0], i32)], False)
+        return b.bitcast(bits, ir.FloatType())
+
+    return types.float32(types.float32), codegen
+
+
+@intrinsic
 def _prefetch(typingctx, array, index):
     """Hint that ``array[index]`` will be read."""
 
@@ -156,61 +169,83 @@ def _hashes(hash1, hash2, seed, block, begin, n):
         hash2[_Q(k - begin)] = _mix(y, _U(0), _U(16), _U(1))
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST)
-def _gaussian(h, g):
-    """Two Gaussian numbers from two hashes (Box and Muller): r = sqrt(-2 ln u), angle in half a turn and a random
-    sign. Range +-6.5.
+UNIT = _F(-1.3862943611)
+"""-2 ln 2: Box and Muller's r^2 over log2 u."""
 
-    Polynomials: minimax, error of log2 below 3e-6, of sine and cosine below 7e-7.
+
+@njit(cache=True, nogil=True, forceinline=True)
+def _held5(a, b, c, d, e):
+    return _held(_F(a)), _held(_F(b)), _held(_F(c)), _held(_F(d)), _held(_F(e))
+
+
+@njit(cache=True, nogil=True, forceinline=True)
+def _polynomials():
+    """Minimax coefficients: of log2 (error below 3e-6), of sine and of cosine over half a turn (below 7e-7)."""
+    return (
+        _held5(0.44254493, -0.27560019, 0.18194844, -0.095955811, 0.025841132),
+        _held5(3.14158203, -5.16714292, 2.5419, -0.554638688, 0.0),
+        _held5(0.999999953, -4.93479286, 4.05841194, -1.33188034, 0.219697149),
+    )
+
+
+@njit(cache=True, nogil=True, fastmath=_FAST, forceinline=True)
+def _half_turns(a, p, q):
+    """(sin, cos) of pi a, -0.5 <= a <= 0.5."""
+    a2 = a * a
+    s = a * (p[0] + a2 * (p[1] + a2 * (p[2] + a2 * p[3])))
+    return s, q[0] + a2 * (q[1] + a2 * (q[2] + a2 * (q[3] + a2 * q[4])))
+
+
+@njit(cache=True, nogil=True, fastmath=_FAST)
+def _gaussian(h, g, scale, polynomials):
+    """Two Gaussian numbers of variance scale / UNIT from two hashes (Box and Muller): r = sqrt(-2 ln u), angle in half
+    a turn and a random sign. Range +-6.5.
     """
+    p, sine, cosine = polynomials
     bits = _bits(_F(_I(_I(_I(h >> _I(1)) & _I(0x7FFFFFFF)) | _I(1))))
     w = _float(_I(_I(bits & _I(0x007FFFFF)) | _I(0x3F800000))) - _F(1)
     # log2 u = exponent + w + w (1 - w) q(w): exact at both ends, so that r is right near u = 1
-    q = _F(0.44254493) + w * (
-        _F(-0.27560019) + w * (_F(0.18194844) + w * (_F(-0.095955811) + w * _F(0.025841132)))
-    )
+    q = p[0] + w * (p[1] + w * (p[2] + w * (p[3] + w * p[4])))
     log2u = _F(_I(bits - _I(0x4F000000))) * _F(2.0**-23) + w * (_F(1) - w) * q
-    r = np.sqrt(max(_F(-1.3862943611) * log2u, _F(0)))
-    a = _F(g) * _F(2.0**-32)  # half turns
-    a2 = a * a
-    s = a * (_F(3.14158203) + a2 * (_F(-5.16714292) + a2 * (_F(2.5419) + a2 * _F(-0.554638688))))
-    c = _F(0.999999953) + a2 * (
-        _F(-4.93479286) + a2 * (_F(4.05841194) + a2 * (_F(-1.33188034) + a2 * _F(0.219697149)))
-    )
+    r = np.sqrt(max(scale * log2u, _F(0)))
+    s, c = _half_turns(_F(g) * _F(2.0**-32), sine, cosine)
     return r * s, _float(_I(_bits(r) ^ _I(_I(h & _I(1)) << _I(31)))) * c
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST)
-def noise_span(out_i, out_q, at, hash1, hash2, seed, block, begin, n, sigma):
-    """Samples begin .. begin + n - 1 of a block of ``noise_block`` into out[at ..]."""
+def noise_span(out_i, out_q, at, hash1, hash2, seed, block, begin, n, variance):
+    """Points begin .. begin + n - 1 of a block of white noise into out[at ..]; ``variance`` of I and of Q."""
     _hashes(hash1, hash2, seed, block, begin, n)
     # A loop of its own: the integer and the float part overlap better than fused (0.9 against 1.35 ns).
+    scale, p = UNIT * variance, _polynomials()
     for k in range(n):
-        x, y = _gaussian(hash1[k], hash2[k])
-        out_i[_Q(at) + _Q(k)] = sigma * x
-        out_q[_Q(at) + _Q(k)] = sigma * y
+        out_i[_Q(at) + _Q(k)], out_q[_Q(at) + _Q(k)] = _gaussian(hash1[k], hash2[k], scale, p)
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST)
 def noise_block(out_i, out_q, hash1, hash2, seed, block, sigma):
     """Write BLOCK complex Gaussian samples that depend on (seed, block) alone; sigma^2 is the variance of I and of Q."""
     _hashes(hash1, hash2, seed, block, 0, BLOCK)
+    p = _polynomials()
     for k in range(BLOCK):
-        x, y = _gaussian(hash1[k], hash2[k])
+        x, y = _gaussian(hash1[k], hash2[k], UNIT, p)
         out_i[k] = sigma * x
         out_q[k] = sigma * y
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST)
-def add_noise(out_i, out_q, hash1, hash2, seed, block, sigma, begin, end):
-    """Add sigma times the samples begin .. end - 1 of a block to what is there; its hashes are made with the first."""
-    if begin == 0:
-        _hashes(hash1, hash2, seed, block, 0, BLOCK)
-    for m in range(end - begin):
-        k = _Q(begin) + _Q(m)
-        x, y = _gaussian(hash1[k], hash2[k])
-        out_i[k] += sigma * x
-        out_q[k] += sigma * y
+def add_noise(out_i, out_q, hash1, hash2, seed, block, level, at):
+    """Add a block of white noise of power level^2 in I and Q together: one value, or from ``at`` on one per SUB samples."""
+    _hashes(hash1, hash2, seed, block, 0, BLOCK)
+    p = _polynomials()
+    for sub in range(BLOCK // SUB):
+        a = level[min(at + sub, len(level) - 1)]
+        scale = _F(0.5) * UNIT * a * a
+        for m in range(SUB):
+            k = _Q(sub * SUB) + _Q(m)
+            x, y = _gaussian(hash1[k], hash2[k], scale, p)
+            out_i[k] += x
+            out_q[k] += y
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST)
