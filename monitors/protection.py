@@ -198,6 +198,9 @@ def _unit_level(vertical: bool, k: int, allowed: float, threshold: float, dof: i
             middle = 0.5 * (low + high)
             over = tail(middle, shift[worst]) > may[worst]
             low, high = (middle, high) if over else (low, middle)
+        # Either tail is at most exp(-(level - shift)^2 / 2) above the shift (Simon and Alouini 2000, IEEE Trans. Commun. 48, 359).
+        may_be = np.exp(-0.5 * np.maximum(high - shift, 0.0) ** 2) > may
+        shift, may = shift[may_be], may[may_be]
         ratio = tail(high, shift) / may
         low, left = high, ratio > 1.0
         shift, may, ratio = shift[left], may[left], ratio[left]
