@@ -122,6 +122,15 @@ def _piece(t, at, n, p, f, h):
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST)
+def _add_part(out_i, out_q, x_i, x_q, begin, end):
+    """out[begin .. end) += x."""
+    for m in range(end - begin):
+        k = _Q(begin) + _Q(m)
+        out_i[k] += x_i[k]
+        out_q[k] += x_q[k]
+
+
+@njit(cache=True, nogil=True, fastmath=_FAST)
 def _turning(t):
     """W of the row before from W and its turn; of the turn 2 cos is kept: W' = 2 cos W - W''."""
     for m in range(LANES):
@@ -304,9 +313,7 @@ def _sweep(out_i, out_q, first, jammer, p, f, h, level, at_level, work):
         else:
             work[1:3] = 0
             _quadratic(work[1], work[2], here, freq, bend, level, at_level, work[0])
-            for j in range(k, end):
-                out_i[j] += work[1, j]
-                out_q[j] += work[2, j]
+            _add_part(out_i, out_q, work[1], work[2], k, end)
         k = end
 
 
@@ -699,6 +706,4 @@ def add_jammers(
             to_i, to_q, b, first, j, jammers, base, rot_i, rot_q, carrier, level, x, n_cell, codes, waves, taps, work, hash1, hash2
         )  # fmt: skip
         if not whole:
-            for k in range(lo, hi):
-                buf_i[k] += to_i[k]
-                buf_q[k] += to_q[k]
+            _add_part(buf_i, buf_q, to_i, to_q, lo, hi)
