@@ -16,6 +16,7 @@ class Watched:
         self.source = source
         self._every = max(round(EVERY_S * source.fs_hz), BINS * FRAMES)
         self._next = 0
+        self._part = np.zeros((2, 0), np.float32)
         self._rows: list[np.ndarray] = []
 
     def __getattr__(self, name: str) -> Any:
@@ -24,12 +25,16 @@ class Watched:
     def read(self, n: int) -> tuple[int, np.ndarray]:
         """Next samples of the source."""
         n0, iq = self.source.read(n)
-        while self._next < n0 + iq.shape[1]:
-            # Where the slab ends too early for this one, its last samples do.
-            at = min(max(self._next - n0, 0), iq.shape[1] - BINS * FRAMES)
-            if at >= 0:
-                self._rows.append(spectrum_db(iq[:, at : at + BINS * FRAMES]))
+        at = 0 if self._part.shape[1] else max(self._next - n0, 0)
+        while at < iq.shape[1]:  # a slab may hold several, or only a part of one
+            part = iq[:, at : at + BINS * FRAMES - self._part.shape[1]]
+            self._part = np.concatenate([self._part, part], axis=1)
+            if self._part.shape[1] < BINS * FRAMES:
+                break
+            self._rows.append(spectrum_db(self._part))
+            self._part = self._part[:, :0]
             self._next += self._every
+            at = max(self._next - n0, 0)
         return n0, iq
 
     def rows(self) -> np.ndarray:
