@@ -355,8 +355,8 @@ class Pulsed(_Jammer):
 class Narrowband(_Jammer):
     """Circular Gaussian noise, flat over ``bandwidth_hz``: its noise bandwidth, power over density at the centre.
 
-    White points on a lattice of fs / D >= 1.2 B, D a power of two, under a 12-point Kaiser-windowed sinc (stop band
-    -50 dB; edges of +-0.13 fs / D), keyed by their absolute index; finer by doublings and cubics where D > 2 (images -50 dB).
+    White points on a lattice of fs / D >= 1.2 B, D = 2^k or 3 2^k, under a 9-point Kaiser-windowed sinc (stop band
+    -50 dB; edges of +-0.17 fs / D), keyed by their absolute index; finer by doublings and cubics where D > 3 (images -50 dB).
     """
 
     kind: Literal["Narrowband"] = "Narrowband"
