@@ -193,7 +193,7 @@ def _add_turning(out_i, out_q, t, a, level):
 
 @njit(cache=True, nogil=True)
 def _quadratic(out_i, out_q, p, f, h, level, at_level, t):
-    """out[j] += level exp(2 pi i (p + f j + h j^2)), j < BLOCK; error below 6e-5 for h up to 1e-4."""
+    """out[j] += level exp(2 pi i (p + f j + h j^2)), j < BLOCK; error below 7e-5 for h up to 1e-4."""
     still = abs(h) * (BLOCK * LANES // 2) < STEADY
     tilt, last = BLOCK * h if still else 0.0, len(level) - 1
     _piece(t, _W, LANES, 0.0, f + tilt, h)
