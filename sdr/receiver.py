@@ -86,7 +86,7 @@ class Receiver:
         self.monitors = [m.start(source.fs_hz) for m in spec.monitor]
         self.front = Overheard(source, [m for m in self.monitors if isinstance(m, FrontWatch)])
         self.mitigation = spec.mitigation.start(self.front) if spec.mitigation else None
-        self.source = self.mitigation or self.front
+        self.source: Source = self.mitigation or self.front
         self.fs_hz = float(source.fs_hz)
         self.tracker = spec.tracking.start(source.fs_hz, source.if_hz, spec.codes_path)
         self.telemetry = Telemetry(self.tracker)
