@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 
 from nav import eskf_kernels, kernels
-from nav.eskf import EpochLog, empty_log
+from nav.eskf import EpochLog, empty_log, epochs_of, newest
 
 REMEDY = np.dtype(
     [
@@ -81,7 +81,7 @@ class NavigatorLog:
     def _clear(self) -> None:
         n, m = kernels.N_EKF, 2 * self.slots
         self._ring, self.count = empty_log(self.length, n, m), 0
-        self._views = [EpochLog(*(array[i, ...] for array in self._ring)) for i in range(self.length)]
+        self._views = epochs_of(self._ring)
         self.z, self.h, self.own = np.zeros(m), np.zeros((m, n)), np.ones(m)
         self.seen, self.dx = np.zeros(m, np.bool_), np.zeros(n)
         self._phi, self._qd = np.eye(n), np.zeros((n, n))
@@ -142,11 +142,4 @@ class NavigatorLog:
 
     def log(self, n_epochs: int | None = None) -> EpochLog:
         """The last ``n_epochs`` epochs, oldest first (copies)."""
-        have = min(self.count, self.length)
-        want = have if n_epochs is None else n_epochs
-        if want > have:
-            raise ValueError(
-                f"the log holds {have} epochs, {want} were asked for: wait or shorten the window"
-            )
-        index = np.arange(self.count - want, self.count) % self.length
-        return EpochLog(*(array[index] for array in self._ring))
+        return newest(self._ring, self.count, n_epochs)
