@@ -161,7 +161,8 @@ CHANNEL = np.dtype(
         ("hist_sample", "i8"),
         ("attempts", "i4"),
         ("bit_energy", "f8", 20),
-        ("edges", "f8", 20),  # products of successive prompts of 1 ms by code period mod 20: least where bits change
+        # Products of successive prompts of 1 ms by code period mod 20: least where bits change.
+        ("edges", "f8", 20),
         ("edge_i", "f8"),
         ("edge_q", "f8"),
         ("edge_n", "i8"),
