@@ -96,7 +96,7 @@ def bench(*, quick: bool = False, quiet: bool = False) -> dict[str, Any]:
     say(
         f"  synthesis, 10 sat     {synth / 1e6:6.0f} satellite*Msps   {synth_ratio:5.1f}; CBOC {cboc / 1e6:.0f} component*Msps"
     )
-    costs = _jammer_costs(12 * rounds)
+    costs = _jammer_costs(40 * rounds)
     for name, cost in costs.items():
         say(f"  {name:22s}{cost['satellites']:6.2f} satellites, {cost['noise']:5.2f} thermal generators")
     share = _median([_monitors() for _ in range(rounds)])

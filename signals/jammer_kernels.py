@@ -320,11 +320,12 @@ def _sweep(out_i, out_q, first, jammer, p, f, h, level, at_level, work):
 @njit(cache=True, nogil=True, fastmath=_FAST)
 def _add_wave(out_i, out_q, waves, at, size, level, at_level, re, im):
     """out += level (re + i im) wave, whose imaginary part lies ``size`` values further on; level per sub-block."""
-    for sub in range(BLOCK // SUB):
-        o, w, v = _Q(sub * SUB), _Q(at + sub * SUB), _Q(at + size + sub * SUB)
-        a = level[min(at_level + sub, len(level) - 1)] * _F(1.0 / WAVE_SCALE)
+    step = SUB if len(level) > 1 else BLOCK
+    for begin in range(0, BLOCK, step):
+        o, w, v = _Q(begin), _Q(at + begin), _Q(at + size + begin)
+        a = level[min(at_level + begin // SUB, len(level) - 1)] * _F(1.0 / WAVE_SCALE)
         c, s = a * re, a * im
-        for m in range(SUB):
+        for m in range(step):
             k = _Q(m)
             x, y = _F(waves[w + k]), _F(waves[v + k])
             out_i[o + k] += c * x - s * y

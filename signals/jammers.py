@@ -50,7 +50,7 @@ _MAX_LINE = 8
 _PULSE_S = 1.0 / math.sqrt(4.5e11)
 """Width of a DME pulse exp(-alpha t^2 / 2), alpha = 4.5e11 / s^2 (RTCA DO-292; 3.5 us between half-amplitude
 points)."""
-_SHORT_SWEEP = 1 << 14
+_SHORT_SWEEP = 1 << 15
 """Samples up to which a sweep comes from a table: beyond, blocks with a turn, which cost twice, are rare."""
 _SWEEP_TABLE = 1 << 20
 """Values in the table of a short sweep: 4 MB."""
@@ -255,7 +255,7 @@ class CW(_Jammer):
 class Chirp(_Jammer):
     """A tone swept over ``sweep_hz`` about its centre in ``sweep_s``: up and again (sawtooth), or up and down.
 
-    Sweeps of up to 16,384 samples come from a table whose rows begin 1/P of a sample apart, with P (M + 1032) up to 2^20
+    Sweeps of up to 32,768 samples come from a table whose rows begin 1/P of a sample apart, with P (M + 1032) up to 2^20
     and P up to 256: an error of 2e-3 to 6e-3 rad at most, -44 dB. Longer ones are exact.
     """
 
