@@ -328,7 +328,7 @@ def reproduce(
 ) -> None:
     """Run a published experiment again and compare: figures, a table, and verdicts.
 
-    NAME is ouzeau2008, abdelhafez-als, abdelhafez-bias, vanek1999, karaim2020 or high-dynamics.
+    NAME: ouzeau2008, abdelhafez-als, abdelhafez-bias, vanek1999, karaim2020, integrity-live, high-dynamics.
     """
     from sdr import reproduce as reproducer
 
