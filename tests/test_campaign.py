@@ -1,5 +1,6 @@
 """Campaigns: the same counts whatever happened on the way; stop rules; refusals."""
 
+import contextlib
 import json
 import os
 import signal
@@ -410,9 +411,13 @@ def cluster(tmp_path):
     processes = [scheduler]
     try:
         deadline = time.monotonic() + 60
-        while not note.exists() and time.monotonic() < deadline:
+        address = None
+        while address is None and time.monotonic() < deadline:
             time.sleep(0.05)
-        address = json.loads(note.read_text())["address"]
+            with contextlib.suppress(
+                FileNotFoundError, json.JSONDecodeError
+            ):  # not there yet, or half written
+                address = json.loads(note.read_text())["address"]
         processes += [
             _start("dask_worker", address, "--no-nanny", "--nthreads", "1", "--no-dashboard", "--host", "127.0.0.1",
                    "--local-directory", str(tmp_path / f"w{i}"), "--death-timeout", "60")
