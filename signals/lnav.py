@@ -13,6 +13,9 @@ from signals.fields import Field, bits_of, check_start, integer, pack, unpack
 from signals.records import EPHEMERIS, IONO_UTC
 
 BROADCAST = tuple(name for name in EPHEMERIS.names or () if name != "system")
+_ANY_TIME = {"prn", "week", "tow_s", "iode", "iodc", "accuracy_index", "health", "fit_interval"}
+OF_ONE_ISSUE = set(BROADCAST) - _ANY_TIME
+"""Fields that change with IODC and IODE only."""
 BIT_MS = 20
 FIRST_WEEK = 1900
 """Default start of the 1024 weeks into which the truncated week is resolved (2016-06-05)."""
@@ -452,6 +455,7 @@ class Decoder:
         self._candidate_index = -1  # of the header it came from
         self._week_anchor: tuple[int, int, int] | None = None  # (week, index of a symbol in it, phase)
         self._subframes: dict[int, dict[str, float]] = {}
+        self._said: dict[int, dict[str, float]] = {}  # orbit or clock of the last subframe of each kind
 
     @property
     def healthy(self) -> bool | None:
@@ -604,6 +608,8 @@ class Decoder:
     def _take(self, number: int, message: int, index: int) -> None:
         if number <= 3:
             values = unpack((SUBFRAME_1, SUBFRAME_2, SUBFRAME_3)[number - 1], message, SUBFRAME_BITS)
+            if self._contradicts(number, values):
+                return
             self._subframes[number] = values | {"index": index}
             if number == 1 and self._phase_candidate is not None:
                 self.health = int(values["health"])
@@ -620,6 +626,19 @@ class Decoder:
             values = unpack(ALMANAC, message, SUBFRAME_BITS)
             values["i0_rad"] = values.pop("delta_i_rad") + REFERENCE_INCLINATION_RAD
             self.almanac[int(page["sv_id"])] = values
+
+    def _contradicts(self, number: int, values: dict[str, float]) -> bool:
+        """Whether an orbit or clock came otherwise before under the same issue, which does not happen (20.3.4.4).
+
+        It is an error that parity let pass, as one word in 64 at a half-cycle slip; but what comes alike twice running is
+        right, and the first time was wrong.
+        """
+        issue, held = "iodc" if number == 1 else "iode", self.ephemeris
+        said = {n: values[n] for n in OF_ONE_ISSUE & values.keys()}
+        before, self._said[number] = self._said.get(number), said
+        if held is None or held[issue] != values[issue] or said == before:
+            return False
+        return any(held[n] != value for n, value in said.items())
 
     def _assemble(self) -> None:
         """Ephemeris from subframes 1, 2, 3 if they are of one data set and time is known."""

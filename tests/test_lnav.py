@@ -285,6 +285,20 @@ def test_noise_never_yields_a_wrong_ephemeris() -> None:
     assert decoder.tow_of(0) == 0
 
 
+@pytest.mark.parametrize(
+    "sent, read", [("abaaa", "aaaaa"), ("baaaa", "bbaaa"), ("ababa", "aaaaa"), ("abbaa", "aabba")]
+)
+def test_another_clock_under_the_same_issue_is_believed_when_it_comes_twice(sent: str, read: str) -> None:
+    """Frames b carry another af0 than a, in a word that passes parity."""
+    records = {"a": ephemeris(), "b": ephemeris(af0_s=-9e-5)}
+    streams = {name: stream(150, record=record).astype(np.float32) for name, record in records.items()}
+    decoder = lnav.Decoder(5)
+    for k, (now, expected) in enumerate(zip(sent, read)):
+        part = slice(1500 * k, 1500 * (k + 1))
+        assert all(ok for *_, ok in decoder.feed(streams[now][part], part.start))
+        assert same(decoder.ephemeris, records[expected])
+
+
 def test_loss_of_sync_and_recovery() -> None:
     bits = stream(90, 0).astype(np.float32)
     bits[900:2000] = np.random.default_rng(3).standard_normal(1100)
