@@ -302,13 +302,13 @@ def campaign(
     FILE is a TOML file or the name of a built-in campaign (see: gnssbb scenarios).
     """
     if confirm is not None:
-        from sdr import confirm as confirmer
+        from sdr.campaign import confirm as confirmer
 
         _report("campaign", confirmer.confirm(file, confirm, overrides=set_, quiet=json), json)
         return
-    from sdr import farm
+    from sdr.campaign import run as runner
 
-    result = farm.run(
+    result = runner.run(
         file, output=output, workers=workers, scheduler=scheduler, overrides=set_, plots=plots, quiet=json
     )
     _report("campaign", result, json)
@@ -342,9 +342,9 @@ def reproduce(
 @app.command
 def scenarios(*, json: Json = False) -> None:
     """List the built-in scenarios."""
-    from sdr import scenario
+    from sdr import scenario, toml
 
-    table = [{"name": n, "description": scenario.load(n)[0].description} for n in scenario.built_in()]
+    table = [{"name": n, "description": scenario.load(n)[0].description} for n in toml.built_in("scenario")]
     _report(
         "scenarios",
         {"scenarios": table, "text": "\n".join(f"{r['name']:24} {r['description']}" for r in table)},

@@ -20,7 +20,8 @@ import numpy as np
 from monitors.fft import FftMonitor
 from sdr import iffile, scenario
 from sdr.receiver import Receiver
-from sdr.watch import WatchSpec, one_blas_thread
+from sdr.watch.channels import WatchSpec
+from sdr.watch.null import one_blas_thread
 from signals.kernels import noise_block
 from signals.modulation import BLOCK
 from signals.source import SyntheticSource

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sdr import iffile, scenario
-from sdr.jobs import _progress
+from sdr.progress import progress
 from sdr.scenario import Scenario
 from sdr.store import Store
 from signals.frontend import FrontEnd, FrontEndSpec
@@ -88,7 +88,7 @@ def inject(
             extra,
         ) as writer,
         Store(truth_path, command="inject", scenario=text, seed=spec.seed) as store,
-        _progress(spec.name, source.n_samples, quiet) as advance,
+        progress(spec.name, source.n_samples, quiet) as advance,
     ):
         _stream(recorded, runs, echoes, front_end, writer, advance)
         index = np.arange(0, source.n_samples, max(round(0.1 * source.fs_hz), 1)).astype(np.uint64)

@@ -1,9 +1,8 @@
 """The jobs behind the commands: run, simulate, receive, acquire. Each returns the command's JSON object."""
 
-import contextlib
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,14 +10,15 @@ import numpy as np
 
 from nav.sensor_files import write_barometer, write_imu, write_odometer
 from nav.steering import Sensors
-from sdr import iffile, scenario
+from sdr import iffile, scenario, toml
 from sdr.modes import SideBySide, table
 from sdr.modes import draw as draw_modes
+from sdr.progress import progress
 from sdr.receiver import Outcome, Receiver
 from sdr.scenario import ReceiverSpec, Scenario
 from sdr.spectrum import EVERY_S, Watched
 from sdr.store import Store
-from sdr.watch_post import report_lines, totals
+from sdr.watch.post import report_lines, totals
 from signals.geodesy import ecef_to_geodetic
 from signals.modulation import SIGNALS
 from tracking.acquisition import AcquisitionSpec, slab_samples
@@ -99,7 +99,7 @@ def simulate(
     with (
         iffile.create_recording(base, source, spec) as writer,
         Store(truth_path, command="simulate", scenario=text, seed=spec.seed) as store,
-        _progress(spec.name, source.n_samples, quiet) as advance,
+        progress(spec.name, source.n_samples, quiet) as advance,
     ):
         truth = _Truth(source, store)
         done = 0
@@ -157,7 +157,7 @@ def acquire(
     if unknown:
         raise ValueError(f"signal '{unknown[0]}' is not known; allowed: {', '.join(SIGNALS)}")
     given = {"doppler_range_hz": doppler_hz, "p_fa": p_fa}
-    spec = scenario.validate(AcquisitionSpec, {k: v for k, v in given.items() if v is not None}, "acquire")
+    spec = toml.validate(AcquisitionSpec, {k: v for k, v in given.items() if v is not None}, "acquire")
     source = iffile.open_recording(file, iffile.declaration(file, recording))
     n = max(slab_samples(s, source.fs_hz, spec) for s in signals)
     n0, iq = _first(source, file, n)
@@ -243,7 +243,7 @@ def _receive(
     tally = _Tally()
     begin = time.perf_counter()
     try:
-        with _progress(label, source.n_samples, quiet) as advance:
+        with progress(label, source.n_samples, quiet) as advance:
             for outcome in receiver:
                 _store_outcome(store, receiver, outcome, tally)
                 if side:
@@ -478,22 +478,3 @@ def _steering_text(s: dict[str, Any]) -> str:
         return f"{head} never steered: {s['reason']}"
     text = f"{head} from {s['first_s']:.1f} s on, {s['steered_s']:.1f} s with satellites and {s['coasting_s']:.1f} s without"
     return text + (f", let go {s['released']} times, the last at {s['reason']}" if s["released"] else "")
-
-
-@contextlib.contextmanager
-def _progress(label: str, total: int, quiet: bool) -> Iterator[Callable[..., None]]:
-    """A bar on stderr with the time left; silent when it is not a terminal or not wanted."""
-    import sys
-
-    if quiet or not sys.stderr.isatty():
-        yield lambda done, note="": None
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:3.0f} %"))
-    with Progress(
-        *columns, TimeRemainingColumn(), TextColumn("{task.fields[note]}"), console=Console(stderr=True)
-    ) as bar:
-        task = bar.add_task(label, total=total, note="")
-        yield lambda done, note="": bar.update(task, completed=done, note=note)

@@ -47,14 +47,14 @@ def plot(results: Path, directory: Path | None = None) -> list[Path]:
     """Draw every figure that ``results`` has data for; returns their paths."""
     from sdr.integrity_figures import integrity, stanford
     from sdr.truth_figures import echoes, motion
-    from sdr.watch_figures import alarms, monitors
+    from sdr.watch.figures import alarms, monitors
 
     directory = directory or Path(results).with_suffix("")
     with store.read(results) as h5:
         if "campaign/points" in h5:
-            from sdr import campaign_plot
+            from sdr.campaign import figures
 
-            return campaign_plot.plot(results, directory)
+            return figures.plot(results, directory)
         directory.mkdir(parents=True, exist_ok=True)
         channels = _channels(h5)
         drawn = []

@@ -19,8 +19,8 @@ from nav.records import SOLUTION
 from nav.steering import Sensors, Steering
 from sdr.drift import CodeDrift
 from sdr.scenario import ReceiverSpec
-from sdr.watch import Flags, Watch
-from sdr.watch_front import FrontWatch, Overheard
+from sdr.watch.channels import Flags, Watch
+from sdr.watch.front import FrontWatch, Overheard
 from signals.modulation import SIGNALS
 from tracking.acquisition import acquire, slab_samples
 from tracking.channel import STATE_IDLE, STATE_LOCKED, STATE_LOST

@@ -250,12 +250,12 @@ def results_lines() -> Iterator[str]:
     """Every structured dataset of a results file."""
     import monitors.records
     import nav.records
-    import sdr.campaign
-    import sdr.farm
+    import sdr.campaign.results
+    import sdr.campaign.spec
     import sdr.findings
     import sdr.modes
     import sdr.respond
-    import sdr.watch_post
+    import sdr.watch.post
     import signals.records
     import tracking.mitigation
     import tracking.records
@@ -273,20 +273,20 @@ def results_lines() -> Iterator[str]:
         ("truth/jammers", s, "JAMMER_TRUTH"),
         ("truth/echoes", s, "ECHO_TRUTH"),
         ("truth/faults", s, "FAULT_TRUTH"),
-        ("monitors/<name>", sdr.watch_post, "MONITOR"),
-        ("monitors/thresholds", sdr.watch_post, "WATCHED"),
+        ("monitors/<name>", sdr.watch.post, "MONITOR"),
+        ("monitors/thresholds", sdr.watch.post, "WATCHED"),
         ("monitors/alarms", monitors.records, "ALARM"),
-        ("monitors/unwatched", sdr.watch_post, "UNWATCHED"),
+        ("monitors/unwatched", sdr.watch.post, "UNWATCHED"),
         ("monitors/<integrity monitor>", sdr.findings, "INTEGRITY"),
         ("monitors/protection", sdr.findings, "PROTECTION"),
         ("monitors/response", sdr.respond, "RESPONSE"),
         ("mitigation/tones", tracking.mitigation, "TONE"),
         ("modes/<mode>/track", sdr.modes, "TRACK"),
-        ("trials (campaigns)", sdr.campaign, "TRIAL"),
-        ("thresholds (campaigns)", sdr.campaign, "THRESHOLD"),
-        ("rates (campaigns)", sdr.farm, "RATE"),
-        ("advantages (campaigns)", sdr.farm, "ADVANTAGE"),
-        ("mask (campaigns)", sdr.farm, "MASK"),
+        ("trials (campaigns)", sdr.campaign.spec, "TRIAL"),
+        ("thresholds (campaigns)", sdr.campaign.spec, "THRESHOLD"),
+        ("rates (campaigns)", sdr.campaign.results, "RATE"),
+        ("advantages (campaigns)", sdr.campaign.results, "ADVANTAGE"),
+        ("mask (campaigns)", sdr.campaign.results, "MASK"),
     ):
         yield from record_lines(place, module, name)
 
@@ -296,8 +296,8 @@ def results_lines() -> Iterator[str]:
 
 def scenario_page() -> Iterator[str]:
     """Scenario files, then campaign files."""
-    from sdr.campaign import CampaignSpec
-    from sdr.recorded import RecordedSpec
+    from sdr.campaign.recorded import RecordedSpec
+    from sdr.campaign.spec import CampaignSpec
     from sdr.scenario import ReceiverSpec, Scenario
 
     yield "## Scenario files"

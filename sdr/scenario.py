@@ -5,14 +5,13 @@ out-of-range key is refused with the key, the value and what is allowed.
 """
 
 import threading
-import tomllib
 from collections.abc import Callable, Sequence
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from nav.imu import (
     BarometerSpec,
@@ -26,9 +25,10 @@ from nav.navigator import NavigationSpec
 from nav.sensor_files import read_barometer, read_imu, read_odometer
 from nav.steering import Sensors
 from nav.ultratight import SteeringSpec
+from sdr import toml
 from sdr.integrity import IntegritySpec
 from sdr.respond import RespondSpec
-from sdr.watch import WatchSpec
+from sdr.watch.channels import WatchSpec
 from signals.clock import ClockSpec
 from signals.faults import FaultSpec, faulty
 from signals.frontend import FrontEndSpec
@@ -42,9 +42,7 @@ from tracking.acquisition import AcquisitionSpec
 from tracking.channel import TrackingSpec
 from tracking.mitigation import MitigationSpec
 
-T = TypeVar("T", bound=BaseModel)
 SCHEMA = 1
-MAX_SCENARIO_BYTES = 1 << 20
 
 
 class ReceiverSpec(BaseModel):
@@ -271,123 +269,36 @@ def _child(spec: Scenario, *part: int) -> np.random.SeedSequence:
     return np.random.SeedSequence(spec.seed, spawn_key=part)
 
 
-def built_in() -> list[str]:
-    """Names of the scenarios that come with the package."""
-    return sorted(
-        p.name.removesuffix(".toml")
-        for p in (files("sdr") / "scenarios").iterdir()
-        if p.name.endswith(".toml")
-    )
-
-
 def load(name_or_path: str, overrides: Sequence[str] = ()) -> tuple[Scenario, str]:
     """Read a scenario by built-in name or by path; return it with its text.
 
     ``overrides`` are ``key=value`` with the dotted path of the key; they are appended to the text as comments, so that
     a stored scenario says how it was run. Raises ValueError with one sentence for anything that is not valid.
     """
-    path = Path(name_or_path)
-    if path.suffix != ".toml" and name_or_path in built_in():
-        text = (files("sdr") / "scenarios" / f"{name_or_path}.toml").read_text(encoding="utf-8")
-        return parse(text, name_or_path, overrides), _with_overrides(text, overrides)
-    if not path.is_file():
-        raise ValueError(
-            f"scenario '{name_or_path}' is neither a file nor a built-in name; built in are: {', '.join(built_in())}"
-        )
-    if path.stat().st_size > MAX_SCENARIO_BYTES:
-        raise ValueError(
-            f"scenario '{path}' is larger than {MAX_SCENARIO_BYTES} bytes; a scenario is a short TOML text"
-        )
-    try:
-        text = path.read_text(encoding="utf-8")
-    except UnicodeDecodeError:
-        raise ValueError(f"scenario '{path}' is not UTF-8 text; a scenario is a TOML file") from None
-    return parse(text, str(path), overrides), _with_overrides(text, overrides)
+    text = toml.read(name_or_path, "scenario")
+    return parse(text, name_or_path, overrides), _with_overrides(text, overrides)
 
 
 def receiver_only(overrides: Sequence[str] = ()) -> tuple[ReceiverSpec, str]:
     """The default receiver with ``receiver.*`` overrides, for recordings; and its text."""
     table: dict[str, Any] = {}
-    _apply(table, overrides)
+    toml.override(table, overrides)
     foreign = sorted(set(table) - {"receiver"})
     if foreign:
         raise ValueError(
             f"--set {foreign[0]}...: a recording is received with [receiver] alone; allowed: receiver.*"
         )
-    return validate(ReceiverSpec, table.get("receiver", {}), "receiver"), _with_overrides("", overrides)
+    return toml.validate(ReceiverSpec, table.get("receiver", {}), "receiver"), _with_overrides("", overrides)
 
 
 def _with_overrides(text: str, overrides: Sequence[str]) -> str:
     return text + "".join(f"\n# --set {o}" for o in overrides)
 
 
-def _apply(table: dict[str, Any], overrides: Sequence[str]) -> None:
-    """Set dotted keys of ``table``; values are TOML, and what is not is taken as a string."""
-    for override in overrides:
-        key, equals, value = override.partition("=")
-        if not equals or not all(key.split(".")):
-            raise ValueError(
-                f"--set '{override}' is not key=value, e.g. --set receiver.tracking.l1ca.dll_bw_hz=1"
-            )
-        try:
-            parsed = tomllib.loads(f"v = {value}")["v"]
-        except tomllib.TOMLDecodeError:
-            parsed = value
-        *path, last = key.split(".")
-        node: Any = table
-        for part in path:
-            node = node.setdefault(part, {})
-            if not isinstance(node, dict):
-                raise ValueError(f"--set {key}: '{part}' is not a section that can be overridden by key")
-        node[last] = parsed
-
-
 def parse(text: str, origin: str = "scenario", overrides: Sequence[str] = ()) -> Scenario:
     """Build a :class:`Scenario` from TOML text; ``origin`` names it in errors."""
-    try:
-        table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as err:
-        raise ValueError(f"{origin} is not valid TOML: {err}") from None
-    _apply(table, overrides)
-    spec = validate(Scenario, table, origin)
+    spec = toml.validate(Scenario, toml.table(text, origin, overrides), origin)
     if isinstance(spec.motion, Recorded):
         motion = spec.motion.model_copy(update={"path": _shipped(spec.motion.path)})
         return spec.model_copy(update={"motion": motion})
     return spec
-
-
-def validate(model: type[T], table: dict[str, Any], origin: str) -> T:
-    """Validate ``table`` as ``model``, with pydantic's report turned into one sentence."""
-    try:
-        return model.model_validate(table)
-    except ValidationError as err:
-        raise ValueError(f"{origin}: {_sentence(model, err)}") from None
-
-
-def _sentence(model: type[BaseModel], err: ValidationError) -> str:
-    first, *rest = err.errors(include_url=False)
-    keys = [str(k) for k in first["loc"]]
-    where = ".".join(keys) or "the file"
-    message = first["msg"].removeprefix("Value error, ")
-    if first["type"] == "extra_forbidden":
-        allowed = _allowed_keys(model, first["loc"][:-1])
-        text = f"'{where}' is not a known key" + (f"; allowed there: {', '.join(allowed)}" if allowed else "")
-    elif first["type"] == "missing":
-        text = f"'{where}' is missing; it has no default"
-    else:
-        value = first.get("input")
-        shown = f" = {value!r}" if isinstance(value, str | int | float | bool) else ""
-        # pydantic's own messages begin with a capital; ours may begin with PLL.
-        text = f"'{where}'{shown}: {message if message[:2].isupper() else message[0].lower() + message[1:]}"
-    return text + (f" (and {len(rest)} more such error{'s' * (len(rest) > 1)})" if rest else "")
-
-
-def _allowed_keys(model: type[BaseModel], loc: tuple[Any, ...]) -> list[str]:
-    """Keys of the section at ``loc``, as far as the path leads through plain nested models."""
-    current: Any = model
-    for key in loc:
-        field = getattr(current, "model_fields", {}).get(str(key))
-        if field is None:
-            return []
-        current = field.annotation
-    return sorted(f.alias or n for n, f in getattr(current, "model_fields", {}).items())

@@ -7,15 +7,18 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from monitors.detection import clopper_pearson
-from sdr import campaign, crew, farm, store, tally, trials
-from sdr.campaign import THRESHOLD, TRIAL, from_table
-from sdr.tally import PointCount
-from sdr.trials import evaluate_trials, quiet_statistics
+from sdr import store
+from sdr.campaign import crew, results, run, tally, trials
+from sdr.campaign.load import from_table, load
+from sdr.campaign.spec import THRESHOLD, TRIAL
+from sdr.campaign.tally import PointCount
+from sdr.campaign.trials import evaluate_trials, quiet_statistics
 
 TABLE = {
     "name": "small",
@@ -90,7 +93,7 @@ def same(a, b):
 
 
 def environment():
-    return os.environ | {"PYTHONPATH": str(farm.Path(__file__).resolve().parents[1])}
+    return os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parents[1])}
 
 
 def command(file, out, *more):
@@ -103,7 +106,7 @@ def reference(tmp_path_factory):
     base = tmp_path_factory.mktemp("campaign")
     file = write(base / "small.toml", TABLE)
     out = base / "one.h5"
-    result = farm.run(file, output=out, workers=1, quiet=True)
+    result = run.run(file, output=out, workers=1, quiet=True)
     return file, result, contents(out)
 
 
@@ -125,7 +128,7 @@ def test_points_carry_counts_intervals_and_reasons(reference):
 
 def test_workers_do_not_matter(reference, tmp_path):
     file, _, expected = reference
-    farm.run(file, output=tmp_path / "two.h5", workers=2, quiet=True)
+    run.run(file, output=tmp_path / "two.h5", workers=2, quiet=True)
     assert same(contents(tmp_path / "two.h5"), expected)
 
 
@@ -180,7 +183,7 @@ def test_killed_again_and_again_it_ends_the_same(reference, tmp_path):
     if journal.exists():
         with journal.open("r+b") as f:  # and a torn last record
             f.truncate(grown - 11)
-    before = farm.Results(campaign.load(file), out)
+    before = results.Results(load(file), out)
     with before:
         kept = before.resumed
     result = json.loads(
@@ -190,7 +193,7 @@ def test_killed_again_and_again_it_ends_the_same(reference, tmp_path):
     assert same(contents(out), expected)
     assert not journal.exists()
     # Asked once more, it answers from the file.
-    again = farm.run(file, output=out, quiet=True)
+    again = run.run(file, output=out, quiet=True)
     assert again["points"] == result["points"]
 
 
@@ -199,9 +202,9 @@ def test_a_trial_that_came_before_its_turn_is_kept(reference, tmp_path):
     file, _, expected = reference
     trials = expected["trials"]
     later = trials[(trials["point"] == 0) & (trials["trial"] == 1)]
-    with farm.Results(campaign.load(file), tmp_path / "ahead.h5") as begun:
+    with results.Results(load(file), tmp_path / "ahead.h5") as begun:
         begun.keep(later)
-    with farm.Results(campaign.load(file), tmp_path / "ahead.h5") as again:
+    with results.Results(load(file), tmp_path / "ahead.h5") as again:
         assert again.resumed == 1 and again.counts[0].done == 0 and again.counts[0].has(1)
 
 
@@ -344,7 +347,7 @@ def test_p_fa_beyond_the_training_says_how_much_it_needs(tmp_path):
     monitor = [{"name": "fft", "rule": "empirical", "detector": {"kind": "FFT"}}]
     file = write(tmp_path / "c.toml", table(p_fa=1e-5, monitor=monitor, grid={"jammer.js_db": [3.0]}))
     with pytest.raises(ValueError, match="at least 1000000 independent training epochs") as err:
-        farm.run(file, output=tmp_path / "c.h5", workers=1, quiet=True)
+        run.run(file, output=tmp_path / "c.h5", workers=1, quiet=True)
     assert "'fft'" in str(err.value)
 
 
@@ -352,14 +355,14 @@ def test_results_of_another_campaign_or_version_are_left_alone(reference, tmp_pa
     file, _, _ = reference
     out = tmp_path / "mine.h5"
     other = write(tmp_path / "other.toml", table(p_fa=2e-2))
-    with farm.Results(campaign.load(file), out) as r:
+    with results.Results(load(file), out) as r:
         r.write()
     size = out.stat().st_size
     with pytest.raises(ValueError, match="another campaign"):
-        farm.run(other, output=out, workers=1, quiet=True)
-    monkeypatch.setattr(farm, "version", lambda: "99.0")
+        run.run(other, output=out, workers=1, quiet=True)
+    monkeypatch.setattr(results, "version", lambda: "99.0")
     with pytest.raises(ValueError, match="not mixed"):
-        farm.run(file, output=out, workers=1, quiet=True)
+        run.run(file, output=out, workers=1, quiet=True)
     assert out.stat().st_size == size
 
 
@@ -367,10 +370,10 @@ def test_two_at_once_on_one_file_are_refused(reference, tmp_path):
     file, _, _ = reference
     out = tmp_path / "busy.h5"
     with (
-        farm.Results(campaign.load(file), out),
+        results.Results(load(file), out),
         pytest.raises(ValueError, match="another campaign is writing"),
     ):
-        farm.Results(campaign.load(file), out).__enter__()
+        results.Results(load(file), out).__enter__()
 
 
 def test_a_scheduler_that_is_not_there(reference, tmp_path, monkeypatch):
@@ -378,7 +381,7 @@ def test_a_scheduler_that_is_not_there(reference, tmp_path, monkeypatch):
     file, _, _ = reference
     monkeypatch.setattr(crew, "CONNECT_S", 1.0)
     with pytest.raises(OSError, match=r"scheduler 'tcp://127\.0\.0\.1:9' cannot be reached"):
-        farm.run(file, output=tmp_path / "x.h5", scheduler="tcp://127.0.0.1:9", quiet=True)
+        run.run(file, output=tmp_path / "x.h5", scheduler="tcp://127.0.0.1:9", quiet=True)
 
 
 # -- a real cluster on loopback -----------------------------------------------------------------------------------
@@ -464,6 +467,6 @@ def test_a_scheduler_that_dies_leaves_what_was_counted(reference, cluster, tmp_p
     _, errors = p.communicate(timeout=120)
     assert p.returncode == 2, errors.decode()
     assert errors.decode().count("\n") == 1 and "was lost; what was counted stays in" in errors.decode()
-    result = farm.run(file, output=out, workers=1, quiet=True)
+    result = run.run(file, output=out, workers=1, quiet=True)
     assert result["resumed_trials"] > 0
     assert same(contents(out), expected)

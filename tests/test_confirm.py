@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from sdr import confirm
+from sdr.campaign import confirm
 
 TABLE = {
     "name": "confirmed",

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from sdr import counterfactual, iffile, inject, jobs, scenario, store
+from sdr import counterfactual, iffile, inject, jobs, scenario, store, toml
 
 Z = 5.0
 TEXT = """
@@ -291,4 +291,4 @@ def test_the_recording_is_not_overwritten(recording, tmp_path):
     (tmp_path / "i.toml").write_text('name = "i"\nduration_s = 1.0\n[[jammer]]\nkind = "CW"\njn0_dbhz = 60')
     with pytest.raises(ValueError, match="recording itself"):
         inject.inject(recording, Options, str(tmp_path / "i.toml"), recording, quiet=True)
-    assert scenario.built_in()
+    assert toml.built_in("scenario")

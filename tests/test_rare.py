@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from monitors.rare import Splitting, repeated_rate
-from sdr import tally, trials
-from sdr.campaign import THRESHOLD, from_table
+from sdr.campaign import tally, trials
+from sdr.campaign.load import from_table
+from sdr.campaign.spec import THRESHOLD
 
 Z = 5.0
 # Three taps and a tone far below the noise: the code error is that of thermal noise in the loop.

@@ -9,8 +9,9 @@ import sys
 import numpy as np
 import pytest
 
-from sdr import farm, jobs, store, trials
-from sdr.campaign import from_table
+from sdr import jobs, store
+from sdr.campaign import results, run, trials
+from sdr.campaign.load import from_table
 
 SKY = """
 name = "recorded"
@@ -56,7 +57,7 @@ def table(recording, **changes):
 
 
 def test_a_strong_jammer_is_found_and_a_weak_one_is_not(recording, tmp_path):
-    result = farm.execute(from_table(table(recording)), tmp_path / "r.h5", workers=1)
+    result = run.execute(from_table(table(recording)), tmp_path / "r.h5", workers=1)
     weak, strong = result["points"]
     assert weak["axes"] == {"recording": recording, "jammer.jn0_dbhz": 20.0}
     # Two windows of at least two channels, 5 s of 50 tests a second each.
@@ -77,15 +78,15 @@ def test_a_strong_jammer_is_found_and_a_weak_one_is_not(recording, tmp_path):
 
 def test_a_point_without_jammer_counts_false_alarms(recording, tmp_path):
     quiet = table(recording, jammer={"kind": "none"}, grid={}, stop={"max_trials": 1, "definition": "all"})
-    (point,) = farm.execute(from_table(quiet), tmp_path / "q.h5", workers=1)["points"]
+    (point,) = run.execute(from_table(quiet), tmp_path / "q.h5", workers=1)["points"]
     assert point["definition"] == "false_alarm" and point["n"] > 500 and point["rate"] < 0.01
 
 
 DIES = """
-import json, os, signal, sys
-from sdr import campaign, farm
-text, out, after = sys.argv[1], farm.Path(sys.argv[2]), int(sys.argv[3])
-keep, kept = farm.Results.keep, []
+import json, os, pathlib, signal, sys
+from sdr.campaign import load, results, run
+text, out, after = sys.argv[1], pathlib.Path(sys.argv[2]), int(sys.argv[3])
+keep, kept = results.Results.keep, []
 def dies(self, rows):
     keep(self, rows)
     kept.append(rows)
@@ -93,8 +94,8 @@ def dies(self, rows):
         self._journal.write(b"R half a record")
         self._journal.flush()
         os.kill(os.getpid(), signal.SIGKILL)
-farm.Results.keep = dies
-farm.execute(campaign.from_table(json.loads(text)), out, workers=2)
+results.Results.keep = dies
+run.execute(load.from_table(json.loads(text)), out, workers=2)
 """
 
 
@@ -102,7 +103,7 @@ def test_killed_resumed_and_with_other_workers_it_ends_the_same(recording, tmp_p
     """SIGKILL right after the first and after the second chunk that was kept, in the middle of the next record."""
     many = table(recording, stop={"max_trials": 4, "definition": "all", "min_trials": 4})
     one, out = tmp_path / "one.h5", tmp_path / "killed.h5"
-    expected = farm.execute(from_table(many), one, workers=1)
+    expected = run.execute(from_table(many), one, workers=1)
     kept = 0
     for after in (1, 2):
         died = subprocess.run(
@@ -110,10 +111,10 @@ def test_killed_resumed_and_with_other_workers_it_ends_the_same(recording, tmp_p
             env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
         )
         assert died.returncode == -signal.SIGKILL
-        with farm.Results(from_table(many), out) as begun:
+        with results.Results(from_table(many), out) as begun:
             assert kept < begun.resumed < 8 and not begun.complete
             kept = begun.resumed
-    result = farm.execute(from_table(many), out, workers=2)
+    result = run.execute(from_table(many), out, workers=2)
     assert result["resumed_trials"] == kept and result["complete"]
     assert not out.with_name("killed.h5.journal").exists()
     told = [{**p, "output": ""} for p in result["points"]]

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from sdr import reference
-from sdr.campaign import CampaignSpec
+from sdr.campaign.spec import CampaignSpec
 from sdr.scenario import Scenario
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"

@@ -6,10 +6,10 @@ import h5py
 import numpy as np
 import pytest
 
-from sdr import jobs, scenario
+from sdr import jobs, scenario, toml
 
 
-@pytest.mark.parametrize("name", scenario.built_in())
+@pytest.mark.parametrize("name", toml.built_in("scenario"))
 def test_built_in_scenario_delivers_samples(name):
     spec, text = scenario.load(name)
     assert spec.name == name

@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 from monitors.detection import clopper_pearson
-from sdr import campaign_plot, farm, store, tally
-from sdr.campaign import ROC_P_FA, TRIAL, from_table
-from sdr.tally import PointCount
+from sdr import store
+from sdr.campaign import figures, results, run, tally
+from sdr.campaign.load import from_table
+from sdr.campaign.spec import ROC_P_FA, TRIAL
+from sdr.campaign.tally import PointCount
 
 TABLE = {
     "name": "told",
@@ -34,7 +36,7 @@ TABLE = {
 @pytest.fixture(scope="module")
 def told(tmp_path_factory):
     out = tmp_path_factory.mktemp("told") / "told.h5"
-    return farm.execute(from_table(TABLE), out, workers=1), out
+    return run.execute(from_table(TABLE), out, workers=1), out
 
 
 def test_the_real_p_fa_is_counted_on_trials_of_its_own(told):
@@ -135,7 +137,7 @@ def test_times_and_errors_have_intervals(told):
         for kind in ("code", "smoothed"):
             a, b, c = p[f"undetected_{kind}_error_median_ci_m"]
             assert a <= b <= c <= p[f"undetected_{kind}_error_m"] <= p[f"max_{kind}_error_m"]
-    names = {f.stem for f in campaign_plot.plot(out)}
+    names = {f.stem for f in figures.plot(out)}
     assert {"rates", "p_md_curve", "roc", "first_alarm", "errors"} <= names
 
 
@@ -143,11 +145,11 @@ def test_a_lost_carrier_is_left_out_of_the_errors_that_were_held(told):
     """Its range error says how long it was lost; what is told of the others is their largest."""
     result, out = told
     c = from_table(TABLE)
-    with farm.Results(c, out) as results:
-        point = results.counts[0]
+    with results.Results(c, out) as kept:
+        point = kept.counts[0]
     for trial in point.rows[:-1]:
         trial["lost"], trial["max_code_error_m"] = True, 1e6
-    (row, *_) = tally.summarise(c, [point], results.thresholds)
+    (row, *_) = tally.summarise(c, [point], kept.thresholds)
     assert row["max_code_error_m"] == 1e6 and row["lost_trials"] == len(point.rows) - 1
     assert row["held_max_code_error_m"] == pytest.approx(float(point.rows[-1]["max_code_error_m"][0]))
     assert result["points"][0]["held_max_code_error_m"] < 1e6
@@ -165,7 +167,7 @@ def test_a_mask_scan_finds_the_worst_line_by_itself(tmp_path):
         "trial": {"epochs": 500, "settle_epochs": 100}, "training": {"trials": 2, "epochs": 3000},
         "threshold": {"trials": 4, "epochs": 6000}, "stop": {"max_trials": 2, "definition": "all"},
     }  # fmt: skip
-    result = farm.execute(from_table(scan), tmp_path / "scan.h5", workers=1, plots=True)
+    result = run.execute(from_table(scan), tmp_path / "scan.h5", workers=1, plots=True)
     assert [(r["bandwidth_hz"], r["monitor"]) for r in result["mask"]] == [
         (0.0, "fft"), (0.0, "glrt"), (1e4, "fft"), (1e4, "glrt"),
     ]  # fmt: skip

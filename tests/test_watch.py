@@ -10,12 +10,12 @@ import pytest
 
 from monitors.detection import cluster_rate
 from nav.navlog import REMEDY, Remedy
-from sdr import jobs, scenario
+from sdr import jobs, scenario, toml
 from sdr.scenario import ReceiverSpec
-from sdr.watch import Flags, WatchSpec
-from sdr.watch_front import Overheard
-from sdr.watch_null import REHEARSALS, null_of
-from sdr.watch_post import MONITOR, poisson_interval, report_lines, totals
+from sdr.watch.channels import Flags, WatchSpec
+from sdr.watch.front import Overheard
+from sdr.watch.null import REHEARSALS, null_of
+from sdr.watch.post import MONITOR, poisson_interval, report_lines, totals
 from signals.modulation import SIGNALS
 from tracking.channel import STATE_LOCKED
 from tracking.correlator_model import Twin, TwinCW
@@ -171,10 +171,10 @@ def test_a_gap_restarts_the_monitor_but_keeps_its_training():
 
 def test_refusals():
     with pytest.raises(ValueError, match="a window of taps"):
-        scenario.validate(ReceiverSpec, {"monitor": [{"name": "a", "detector": {"kind": "FFT"}}]}, "receiver")
+        toml.validate(ReceiverSpec, {"monitor": [{"name": "a", "detector": {"kind": "FFT"}}]}, "receiver")
     one = {"name": "a", "detector": {"kind": "FFT"}}
     with pytest.raises(ValueError, match="names must differ"):
-        scenario.validate(ReceiverSpec, {"monitor": [one, one]}, "receiver")
+        toml.validate(ReceiverSpec, {"monitor": [one, one]}, "receiver")
 
 
 def test_a_monitor_without_enough_training_says_so_and_the_run_goes_on():

@@ -16,8 +16,9 @@ import numpy as np
 
 from monitors.detection import clopper_pearson
 from monitors.threshold import real_p_fa
-from sdr import farm
-from sdr.campaign import CURVE_EDGES, Campaign, from_table, load
+from sdr.campaign.load import from_table, load
+from sdr.campaign.run import execute
+from sdr.campaign.spec import CURVE_EDGES, Campaign
 from sdr.reproduce import new_figure, row, save_figure, within, write_table
 from signals.constants import METRES_PER_CHIP, WAVELENGTH_M
 from signals.modulation import SIGNALS
@@ -73,7 +74,7 @@ class _Bench:
 
     def run(self, campaign: Campaign, name: str) -> dict[str, Any]:
         """Summary of a campaign, kept under ``name``."""
-        return farm.execute(campaign, self.out / f"{name}.h5", quiet=False)
+        return execute(campaign, self.out / f"{name}.h5", quiet=False)
 
     def size(self, quick: int, full: int) -> int:
         """Trials in this mode."""

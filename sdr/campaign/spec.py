@@ -1,19 +1,15 @@
-"""Campaigns: a grid of settings times many trials of the twin, counted into P_MD, P_FA and tracking error.
+"""The campaign file and its grid: a trial, its thresholds and its stop rules; what is known of a trial.
 
 A campaign file is the CampaignSpec below as TOML: one base ``[twin]``, one ``[jammer]``, the monitors, and
 ``[grid]``, whose keys are dotted paths into them and whose values are lists. A trial is a pure function of
 ``SeedSequence(root, spawn_key=(point, trial))``; training, threshold and evaluation have roots of their own.
 Stop rules are evaluated in the order of the trials, so the result does not depend on who computed what when.
-Trials are computed in ``sdr.trials`` and counted in ``sdr.tally``; ``sdr.farm`` hands them out.
 """
 
 import hashlib
 import itertools
 import json
 import math
-import tomllib
-from functools import lru_cache
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -24,15 +20,14 @@ from monitors.fft import FftMonitor
 from monitors.glrt import GlrtMonitor
 from monitors.rare import Importance, Splitting
 from monitors.threshold import per_epoch, requirement
-from sdr.scenario import validate
-from sdr.watch import Detector
+from sdr.toml import validate
+from sdr.watch.channels import Detector
 from signals.modulation import SIGNALS
 from tracking.correlator_model import Twin, TwinCW, code_spectrum
 
 MAX_POINTS = 20_000
 NAME = r"^[A-Za-z0-9][A-Za-z0-9 ._+-]*$"
 """Names of campaigns become names of files in the working directory."""
-MAX_FILE_BYTES = 1 << 20
 CURVE_BINS = 20
 """Bins of P_MD against |df| T, from 0 to 1."""
 CURVE_EDGES = np.linspace(0.0, 1.0, CURVE_BINS + 1)
@@ -285,7 +280,7 @@ class Campaign:
     """A CampaignSpec with its grid laid out: points, and groups of points that share their thresholds."""
 
     live = False
-    """Whether thresholds are found by a receiver's own monitors (``sdr.recorded``)."""
+    """Whether thresholds are found by a receiver's own monitors (``sdr.campaign.recorded``)."""
 
     def __init__(self, spec: CampaignSpec, text: str) -> None:
         self.spec, self.text = spec, text
@@ -433,62 +428,3 @@ def empty_trial(monitors: int, point: int, trial: int) -> np.ndarray:
 
 def _label(setting: dict[str, Any]) -> str:
     return ", ".join(f"{k} = {v}" for k, v in setting.items()) or "the only point"
-
-
-def load(name_or_path: str, overrides: tuple[str, ...] = ()) -> Any:
-    """Read a campaign by built-in name or by path; ValueError with one sentence for anything not valid."""
-    from sdr.scenario import _apply
-
-    text = _text(name_or_path)
-    try:
-        table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as err:
-        raise ValueError(f"{name_or_path} is not valid TOML: {err}") from None
-    _apply(table, overrides)
-    return from_table(table, name_or_path)
-
-
-def _text(name_or_path: str) -> str:
-    path = Path(name_or_path)
-    if path.suffix != ".toml" and name_or_path in built_in():
-        return (_directory() / f"{name_or_path}.toml").read_text(encoding="utf-8")
-    if not path.is_file():
-        raise ValueError(
-            f"campaign '{name_or_path}' is neither a file nor a built-in name; built in are: {', '.join(built_in())}"
-        )
-    if path.stat().st_size > MAX_FILE_BYTES:
-        raise ValueError(
-            f"campaign '{path}' is larger than {MAX_FILE_BYTES} bytes; a campaign is a short TOML text"
-        )
-    try:
-        return path.read_text(encoding="utf-8")
-    except UnicodeDecodeError:
-        raise ValueError(f"campaign '{path}' is not UTF-8 text; a campaign is a TOML file") from None
-
-
-def _directory() -> Any:
-    from importlib.resources import files
-
-    return files("sdr") / "campaigns"
-
-
-def built_in() -> list[str]:
-    """Names of the campaigns that come with the package."""
-    return sorted(p.name.removesuffix(".toml") for p in _directory().iterdir() if p.name.endswith(".toml"))
-
-
-def from_table(table: dict[str, Any], origin: str = "campaign") -> Any:
-    """Campaign of a parsed table, a RecordedCampaign where it names recordings; its text is canonical JSON, so that
-    workers can rebuild it."""
-    if "recordings" in table:
-        from sdr import recorded
-
-        return recorded.from_table(table, origin)
-    spec = validate(CampaignSpec, table, origin)
-    return Campaign(spec, json.dumps(spec.model_dump(mode="json", by_alias=True), sort_keys=True))
-
-
-@lru_cache(maxsize=4)
-def from_text(text: str) -> Any:
-    """Campaign of the canonical text of another one (``Campaign.text``)."""
-    return from_table(json.loads(text))

@@ -12,7 +12,7 @@ import numpy as np
 
 from monitors.baselines import AdcHistogram, count_levels
 from monitors.short_training import FisherNull, WanderNull
-from sdr.watch_post import Post, joined
+from sdr.watch.post import Post, joined
 
 RMS_LEVELS = 20.0
 """Samples of more than 8 bits are counted on a grid that puts the rms of their beginning here."""

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import numpy as np
 
-from sdr import farm, tally
-from sdr.campaign import CURVE_EDGES, ROC_P_FA, THRESHOLD, TRIAL
+from sdr.campaign import results, tally
+from sdr.campaign.spec import CURVE_EDGES, ROC_P_FA, THRESHOLD, TRIAL
 from sdr.reproduce import new_figure, save_figure
 
 _DATASETS = {
-    "rates": farm.RATE, "trials": TRIAL, "thresholds": THRESHOLD, "advantages": farm.ADVANTAGE, "mask": farm.MASK,
+    "rates": results.RATE, "trials": TRIAL, "thresholds": THRESHOLD, "advantages": results.ADVANTAGE, "mask": results.MASK,
 }  # fmt: skip
 """What is drawn; a dataset without rows is not in the file."""
 
@@ -18,7 +18,7 @@ _DATASETS = {
 def plot(path: Path | str, directory: Path | None = None) -> list[Path]:
     """Draw the figures of a campaign's results; returns their paths."""
     out = directory or Path(path).with_suffix("")
-    with farm.read_rates(path) as h5:
+    with results.read(path) as h5:
         kept = {
             name: h5[f"campaign/{name}"][:] if f"campaign/{name}" in h5 else np.zeros(0, dtype)
             for name, dtype in _DATASETS.items()

@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 
 from monitors.batch import sum_dumps, trial_seed
-from sdr.campaign import Campaign, load
-from sdr.jobs import _progress
-from sdr.trials import fit_thresholds, offset_from_line_hz, quiet_statistics, span, trained
-from sdr.watch import one_blas_thread
+from sdr.campaign.load import load
+from sdr.campaign.spec import Campaign
+from sdr.campaign.trials import fit_thresholds, offset_from_line_hz, quiet_statistics, span, trained
+from sdr.progress import progress
+from sdr.watch.null import one_blas_thread
 from signals.codes import primary_code
 from signals.constants import CHIP_RATE_HZ
 from signals.jammers import Narrowband
@@ -118,7 +119,7 @@ def _on_samples(twin: Twin, seed: Any, duration_s: float, count: int, spacing: f
     t_s, out = [], []
     n = round(SLAB_S * fs_hz)
     total = math.ceil(duration_s * fs_hz / n)
-    with _progress("samples", total, quiet) as advance:
+    with progress("samples", total, quiet) as advance:
         for k in range(total):
             epochs, counts, corr = tracker.process(k * n, samples.read(k * n, n))
             e, z = epochs[c, : counts[c]], corr[c, : counts[c], :count]

@@ -8,7 +8,6 @@ import numpy as np
 
 from monitors.records import ALARM, STATISTIC, alarms
 from monitors.threshold import per_epoch
-from sdr.watch_null import one_blas_thread
 
 MONITOR = np.dtype([("signal", "S4"), ("prn", "i4"), *((n, STATISTIC[n]) for n in STATISTIC.names or ())])
 """STATISTIC of one channel; ``t_s`` is scenario time at the end of its last epoch. Without signal: of the front end."""
@@ -299,15 +298,3 @@ def _events(row: dict[str, Any]) -> list[str]:
         held = "an alarm stood and is held" if gap["alarm"] else "no alarm stood"
         out.append(f"without lock from {gap['start_s']:.1f} to {gap['end_s']:.1f} s: {held}")
     return out
-
-
-__all__ = [
-    "MONITOR",
-    "UNWATCHED",
-    "WATCHED",
-    "Post",
-    "one_blas_thread",
-    "poisson_interval",
-    "report_lines",
-    "totals",
-]

@@ -12,7 +12,7 @@ import numpy as np
 from monitors.detection import Rate, clopper_pearson, cluster_rate, rate
 from monitors.rare import repeated_rate
 from monitors.threshold import per_approach
-from sdr.campaign import ROC_P_FA, Campaign, CampaignSpec
+from sdr.campaign.spec import ROC_P_FA, Campaign, CampaignSpec
 from signals.modulation import SIGNALS
 from tracking.correlator_model import code_spectrum
 

@@ -33,7 +33,7 @@ class Local:
         method = "forkserver" if "forkserver" in mp.get_all_start_methods() else "spawn"
         context = mp.get_context(method)
         if method == "forkserver":
-            context.set_forkserver_preload(["sdr.trials"])
+            context.set_forkserver_preload(["sdr.campaign.trials"])
         self._pool = futures.ProcessPoolExecutor(
             self.workers, mp_context=context, initializer=_obey, initargs=(os.getpid(),)
         )

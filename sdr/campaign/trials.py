@@ -17,7 +17,9 @@ from monitors.glrt import GlrtMonitor
 from monitors.multichannel_ar import MultichannelAr
 from monitors.rare import Course, Importance, Splitting, find_levels, importance_miss_rate, split
 from monitors.threshold import AnalyticNull, EmpiricalNull, GaussianNull, ParetoNull
-from sdr.campaign import (
+from sdr.campaign import recorded
+from sdr.campaign.load import from_text
+from sdr.campaign.spec import (
     CURVE_BINS,
     ROC_P_FA,
     THRESHOLD,
@@ -25,9 +27,8 @@ from sdr.campaign import (
     CampaignSpec,
     MonitorSpec,
     empty_trial,
-    from_text,
 )
-from sdr.watch import one_blas_thread
+from sdr.watch.null import one_blas_thread
 from signals.constants import METRES_PER_CHIP, WAVELENGTH_M
 from tracking.correlator_model import Twin, TwinCW, cw_taps
 from tracking.twin_kernels import hatch_smooth
@@ -148,8 +149,6 @@ def evaluate_trials(text: str, point: int, first: int, count: int, limits: np.nd
 
 
 def _received(campaign: Any, point: int, numbers: range) -> np.ndarray:
-    from sdr import recorded
-
     seeds = [trial_seed(campaign.spec.seeds.evaluation, point, n) for n in numbers]
     return np.concatenate([recorded.trial(campaign, point, n, s) for n, s in zip(numbers, seeds)])
 

@@ -18,7 +18,7 @@ from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
 from monitors.threshold import requirement
 from sdr import iffile, inject
-from sdr.campaign import (
+from sdr.campaign.spec import (
     MAX_POINTS,
     NAME,
     THRESHOLD,
@@ -33,7 +33,7 @@ from sdr.campaign import (
     empty_trial,
 )
 from sdr.receiver import Receiver
-from sdr.scenario import ReceiverSpec, validate
+from sdr.scenario import ReceiverSpec
 from signals.frontend import FrontEndSpec
 from signals.jammers import JammerSpec
 from tracking.channel import STATE_LOCKED
@@ -121,7 +121,7 @@ class RecordedPoint:
 
 
 class RecordedCampaign:
-    """A RecordedSpec with its grid laid out; as ``sdr.campaign.Campaign`` to those who count."""
+    """A RecordedSpec with its grid laid out; as ``sdr.campaign.spec.Campaign`` to those who count."""
 
     live = True
 
@@ -176,14 +176,6 @@ class RecordedCampaign:
         for name in ("threshold", "low", "high", "roc"):
             rows[name] = np.nan
         return rows
-
-
-def from_table(table: dict[str, Any], origin: str) -> RecordedCampaign:
-    """RecordedCampaign of a parsed table."""
-    spec = validate(RecordedSpec, table, origin)
-    return RecordedCampaign(
-        spec, json.dumps(spec.model_dump(mode="json", by_alias=True, exclude_unset=True), sort_keys=True)
-    )
 
 
 def _open(recording: RecordedFile, window_s: float) -> Any:

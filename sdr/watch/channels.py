@@ -3,7 +3,7 @@
 Each locked channel is trained on its own first seconds and then watched. Correlator outputs reach a monitor as
 means over 20 ms (L1CA) or 100 ms (E1) with the data signs wiped. Nothing flows back into the receiver but ``Flags``.
 When lock is lost an alarm that stands is held until tests go on: interference that kills a channel does not end in
-silence. ``watch_null`` says where the thresholds come from, ``watch_front`` what the gain and the samples' levels show.
+silence. ``sdr.watch.null`` says where the thresholds come from, ``sdr.watch.front`` what the gain and the samples' levels show.
 """
 
 import math
@@ -18,9 +18,9 @@ from monitors.fft import FftMonitor
 from monitors.glrt import GlrtMonitor
 from monitors.multichannel_ar import MultichannelAr
 from nav.navlog import REMEDY, Remedy
-from sdr.watch_front import FrontWatch
-from sdr.watch_null import null_of, one_blas_thread
-from sdr.watch_post import MONITOR, Post, joined
+from sdr.watch.front import FrontWatch
+from sdr.watch.null import null_of, one_blas_thread
+from sdr.watch.post import MONITOR, Post, joined
 from signals.multipath import MultipathSpec
 from tracking.channel import STATE_LOCKED
 
