@@ -178,7 +178,7 @@ def _text(name: str, table: dict[str, Any], factors: Sequence[str]) -> str:
 
 
 def _draw(path: Path, name: str, table: dict[str, Any], factors: Sequence[str]) -> Path:
-    from sdr.plot import figure
+    from sdr.figure import figure
 
     satellite = max(table, key=lambda s: table[s]["code_m"]["rms"]["total"] or 0.0)
     title = f"{name}, {satellite}: what each factor does, and their interaction"

@@ -7,7 +7,7 @@ import h5py
 import numpy as np
 
 from sdr.errors import hermite, levels_and_errors, position_errors
-from sdr.plot import figure
+from sdr.figure import figure
 
 LABELS = {
     "innovation": "innovation²/S",

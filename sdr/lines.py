@@ -67,7 +67,7 @@ def _rows(signal: str, waveform: str, prn: int | None, top: int, tiered: bool) -
 
 
 def _draw(directory: Path, signal: str, waveform: str, prn: int, tiered: bool) -> Path:
-    from sdr.plot import figure
+    from sdr.figure import figure
 
     directory.mkdir(parents=True, exist_ok=True)
     path = (

@@ -120,8 +120,7 @@ class SideBySide:
 
     def _note(self, mode: str, outcome: Outcome) -> None:
         self.solutions[mode] += outcome.solutions
-        if outcome.steering is not None:
-            self.steering[mode].append(outcome.steering)
+        self.steering[mode] += outcome.steering
         if self.jam_s is None:
             return
         receiver = self.receivers[mode]
@@ -237,7 +236,7 @@ def draw(results: Path, directory: Path | None = None) -> Path:
     """Position and speed error of the receivers against time, the jam shaded -> modes.png."""
     import h5py
 
-    from sdr.plot import figure
+    from sdr.figure import figure
 
     directory = directory or Path(results).with_suffix("")
     directory.mkdir(parents=True, exist_ok=True)

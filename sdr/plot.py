@@ -1,7 +1,5 @@
 """Figures of a results file: tracking errors, C/N0, I/Q, correlation function, sky and position."""
 
-import contextlib
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,37 +8,7 @@ import numpy as np
 
 from sdr import store
 from sdr.errors import position_errors, satellite_truth, tracking_errors
-
-SIZE_IN = (9.0, 5.0)
-
-
-@contextlib.contextmanager
-def figure(
-    path: Path,
-    title: str,
-    rows: int = 1,
-    projection: str | None = None,
-    size: tuple[float, float] = SIZE_IN,
-    widths: tuple[float, ...] = (1.0,),
-) -> Iterator[Any]:
-    """A figure of ``rows`` axes sharing x (in columns of ``widths``), saved to ``path`` on leaving."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    fig = Figure(figsize=size, layout="constrained")
-    FigureCanvasAgg(fig)
-    axes = fig.subplots(
-        rows,
-        len(widths),
-        sharex="col" if rows > 1 else False,
-        width_ratios=widths,
-        subplot_kw={"projection": projection} if projection else None,
-    )
-    fig.suptitle(title)
-    for ax in np.ravel(axes):
-        ax.grid(alpha=0.3)
-    yield axes
-    fig.savefig(path, dpi=130)
+from sdr.figure import attacks, canvas, channel_name, figure
 
 
 def plot(results: Path, directory: Path | None = None) -> list[Path]:
@@ -87,11 +55,6 @@ def _channels(h5: h5py.File) -> dict[str, h5py.Group]:
     return {n: g for n, g in h5.get("tracking", {}).items() if len(g["epochs"])}
 
 
-def _label(group: h5py.Group) -> str:
-    system = {"L1CA": "G", "E1B": "E", "E1C": "E"}[group["epochs"].attrs["signal"]]
-    return f"{system}{group['epochs'].attrs['prn']:02d}"
-
-
 def _tracking_errors(h5: h5py.File, channels: dict[str, h5py.Group], directory: Path) -> Path | None:
     """Errors in time, all satellites; beside them each satellite's rms against its thermal sigma."""
     with_truth = {}
@@ -131,7 +94,7 @@ def _one_error(
     """One kind of error: over time in the left axes, rms and thermal sigma of each satellite in the right."""
     spans = []
     for k, (name, errors) in enumerate(with_truth.items()):
-        attrs, label = channels[name]["epochs"].attrs, _label(channels[name])
+        attrs, label = channels[name]["epochs"].attrs, channel_name(channels[name])
         settled = errors["t_s"] > errors["t_s"][:1] + 2.0
         values = errors[key][settled]
         row[0].plot(errors["t_s"][settled], values, lw=0.5, alpha=0.6, color=f"C{k}")
@@ -156,7 +119,7 @@ def _cn0(h5: h5py.File, channels: dict[str, h5py.Group], directory: Path) -> Pat
     with figure(path, "Carrier-to-noise density") as ax:
         for group in channels.values():
             e = group["epochs"]
-            ax.plot(e["sample_index"] / e.attrs["fs_hz"], e["cn0_dbhz"], lw=0.8, label=_label(group))
+            ax.plot(e["sample_index"] / e.attrs["fs_hz"], e["cn0_dbhz"], lw=0.8, label=channel_name(group))
         ax.set(xlabel="time (s)", ylabel="C/N0 (dB-Hz)")
         ax.legend(ncol=8, fontsize=7)
     return path
@@ -165,21 +128,17 @@ def _cn0(h5: h5py.File, channels: dict[str, h5py.Group], directory: Path) -> Pat
 def _iq(h5: h5py.File, channels: dict[str, h5py.Group], directory: Path) -> Path | None:
     if not channels:
         return None
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     path = directory / "iq.png"
     columns = min(4, len(channels))
     rows = -(-len(channels) // columns)
-    fig = Figure(figsize=(2.4 * columns, 2.5 * rows), layout="constrained")
-    FigureCanvasAgg(fig)
+    fig = canvas((2.4 * columns, 2.5 * rows))
     fig.suptitle("Prompt correlator, last 2000 integrations (ADC levels)")
     for k, group in enumerate(channels.values()):
         ax = fig.add_subplot(rows, columns, k + 1)
         e = group["epochs"][-2000:]
         ax.plot(e["prompt_i"], e["prompt_q"], ".", ms=1.5, alpha=0.4)
         limit = 1.1 * float(max(np.abs(e["prompt_i"]).max(), np.abs(e["prompt_q"]).max(), 1e-9))
-        ax.set(xlim=(-limit, limit), ylim=(-limit, limit), aspect="equal", title=_label(group))
+        ax.set(xlim=(-limit, limit), ylim=(-limit, limit), aspect="equal", title=channel_name(group))
         ax.tick_params(labelsize=6)
         ax.grid(alpha=0.3)
     fig.savefig(path, dpi=130)
@@ -199,7 +158,9 @@ def _correlation(h5: h5py.File, channels: dict[str, h5py.Group], directory: Path
             prompt = int(np.argmin(np.abs(taps)))
             aligned = np.mean(corr * np.exp(-1j * np.angle(corr[:, prompt : prompt + 1])), axis=0).real
             order = np.argsort(taps)
-            ax.plot(taps[order], aligned[order] / aligned[prompt], ".-", ms=4, lw=0.8, label=_label(group))
+            ax.plot(
+                taps[order], aligned[order] / aligned[prompt], ".-", ms=4, lw=0.8, label=channel_name(group)
+            )
         attrs = next(iter(grouped.values()))["corr"].attrs
         d = np.linspace(-1.5, 1.5, 601)
         ax.plot(d, chip_acf(d, attrs["waveform"], attrs["waveform"]), "k", lw=0.8, alpha=0.5, label="ideal")
@@ -215,7 +176,7 @@ def _sky(h5: h5py.File, channels: dict[str, h5py.Group], directory: Path) -> Pat
     rows = rows[rows["elevation_rad"] > 0]
     if not len(rows):
         return None
-    tracked = {_label(g) for g in channels.values()}
+    tracked = {channel_name(g) for g in channels.values()}
     path = directory / "sky.png"
     with figure(path, "Sky", projection="polar", size=(6, 6)) as ax:
         ax.set_theta_zero_location("N")
@@ -279,20 +240,6 @@ def _position(h5: h5py.File, channels: dict[str, h5py.Group], directory: Path) -
     return path
 
 
-def attacks(h5: h5py.File) -> list[tuple[float, float]]:
-    """Times (begin, end) in s during which any jammer is on."""
-    if "truth/jammers" not in h5:
-        return []
-    rows = h5["truth/jammers"][:]
-    t_s, k = np.unique(rows["t_s"], return_inverse=True)
-    on = np.bincount(k, rows["on"]) > 0
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], on.astype(int), [0]])))
-    return [
-        (float(t_s[a]), float(t_s[min(b, len(t_s) - 1)]))
-        for a, b in zip(edges[::2], edges[1::2], strict=True)
-    ]
-
-
 def _spectrum(h5: h5py.File, channels: dict[str, h5py.Group], directory: Path) -> Path | None:
     """Waterfall of what was received, and its mean with and without attack."""
     if "samples/spectrum" not in h5 or len(h5["samples/spectrum"]) < 2:
@@ -342,7 +289,7 @@ def _attack(h5: h5py.File, channels: dict[str, h5py.Group], directory: Path) -> 
             e, color = group["epochs"][:], f"C{k}"
             attrs = group["epochs"].attrs
             t_s = e["sample_index"] / attrs["fs_hz"]
-            axes[0].plot(t_s, e["cn0_dbhz"], lw=0.8, color=color, label=_label(group))
+            axes[0].plot(t_s, e["cn0_dbhz"], lw=0.8, color=color, label=channel_name(group))
             truth = satellite_truth(h5, b"G" if attrs["signal"] == "L1CA" else b"E", attrs["prn"])
             if len(truth) > 1:
                 errors = tracking_errors(e, truth, attrs["fs_hz"], attrs["signal"])
@@ -391,7 +338,7 @@ def _attacked_peak(h5: h5py.File, channels: dict[str, h5py.Group], directory: Pa
     order, path = np.argsort(taps), directory / "correlation_attack.png"
     prompt = int(np.argmin(np.abs(taps)))
     with figure(
-        path, f"Correlation function of {_label(group)}: in-phase part, 10 to 90 % of the epochs"
+        path, f"Correlation function of {channel_name(group)}: in-phase part, 10 to 90 % of the epochs"
     ) as ax:
         for mask, label, color in ((before, "before", "C0"), (during, "during", "C3")):
             corr = group["corr"][:][mask]

@@ -300,7 +300,7 @@ def _text(path: Path, result: dict[str, Any]) -> str:
 def _draw(
     directory: Path, iq: np.ndarray, psd: tuple[np.ndarray, np.ndarray], spurs: list[dict[str, float]]
 ) -> list[Path]:
-    from sdr.plot import figure
+    from sdr.figure import figure
 
     freq_hz, psd_db = psd
 

@@ -6,6 +6,7 @@ import h5py
 import numpy as np
 
 from sdr.errors import satellite_truth, tracking_errors
+from sdr.figure import channel_name, figure
 from signals.constants import C_MPS, F_L1_HZ, WAVELENGTH_M
 
 FASTEST_STANDING_MPS = 1.0
@@ -15,8 +16,6 @@ ORBIT_MPS2 = 1.0
 
 def motion(h5: h5py.File, channels: dict[str, h5py.Group], directory: Path) -> Path | None:
     """Speed, acceleration along the lines of sight, Doppler and clock of a run in which something moves."""
-    from sdr.plot import figure
-
     if "truth/receiver" not in h5 or "truth/satellites" not in h5 or len(h5["truth/receiver"]) < 2:
         return None
     receiver, satellites = h5["truth/receiver"][:], h5["truth/satellites"][:]
@@ -62,8 +61,6 @@ def _line_of_sight(rows: np.ndarray, receiver: np.ndarray) -> tuple[np.ndarray, 
 
 def echoes(h5: h5py.File, channels: dict[str, h5py.Group], directory: Path) -> Path | None:
     """The echoes of the satellite whose code errs most for them: power, delay, phase, and the errors they make."""
-    from sdr.plot import _label, figure
-
     if "truth/echoes" not in h5 or not len(h5["truth/echoes"]):
         return None
     rows = h5["truth/echoes"][:]
@@ -73,7 +70,7 @@ def echoes(h5: h5py.File, channels: dict[str, h5py.Group], directory: Path) -> P
         system = b"G" if attrs["signal"] == "L1CA" else b"E"
         truth = satellite_truth(h5, system, attrs["prn"])
         if len(truth) > 1 and np.any((rows["system"] == system) & (rows["prn"] == attrs["prn"])):
-            errors[_label(group)] = tracking_errors(
+            errors[channel_name(group)] = tracking_errors(
                 group["epochs"][:], truth, attrs["fs_hz"], attrs["signal"]
             )
     errors = {n: {k: v[e["t_s"] > e["t_s"][:1] + 1.0] for k, v in e.items()} for n, e in errors.items()}

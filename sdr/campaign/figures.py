@@ -7,7 +7,7 @@ import numpy as np
 
 from sdr.campaign import results, tally
 from sdr.campaign.spec import CURVE_EDGES, ROC_P_FA, THRESHOLD, TRIAL
-from sdr.reproduce import new_figure, save_figure
+from sdr.figure import new_figure, save_figure
 
 _DATASETS = {
     "rates": results.RATE, "trials": TRIAL, "thresholds": THRESHOLD, "advantages": results.ADVANTAGE, "mask": results.MASK,

@@ -8,18 +8,13 @@ import csv
 import json
 from pathlib import Path
 
-from monitors.detection import clopper_pearson
-
 __all__ = [
     "COLUMNS",
     "EXPERIMENTS",
     "VERDICTS",
-    "clopper_pearson",
     "format_table",
-    "new_figure",
     "reproduce",
     "row",
-    "save_figure",
     "within",
     "write_table",
 ]
@@ -29,7 +24,7 @@ EXPERIMENTS = {
     "abdelhafez-als": "sdr.reproduce.als",
     "abdelhafez-bias": "sdr.reproduce.bias",
     "vanek1999": "sdr.reproduce.vanek",
-    "karaim2020": "sdr.reproduce.karaim",
+    "karaim2020": "sdr.reproduce.karaim_report",
     "integrity-live": "sdr.reproduce.live",
     "high-dynamics": "sdr.reproduce.aided_loops",
 }
@@ -79,26 +74,6 @@ def format_table(rows: list[dict]) -> str:
     return "\n".join(
         "  ".join([*(c.ljust(w) for c, w in zip(line, width)), line[-1]]).rstrip() for line in table
     )
-
-
-def save_figure(figure, out_dir: str | Path, name: str) -> Path:
-    """Write a matplotlib figure as PNG and release it."""
-    out = Path(out_dir)
-    out.mkdir(parents=True, exist_ok=True)
-    path = out / f"{name}.png"
-    figure.savefig(path, dpi=110)
-    figure.clear()
-    return path
-
-
-def new_figure(rows: int, columns: int, size=(9.0, 6.0), **options):
-    """(figure, axes) of a file-only figure; matplotlib is imported here and pyplot's state is not used."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=size, layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure, figure.subplots(rows, columns, **options)
 
 
 def reproduce(name: str, out_dir: str | Path | None = None, quick: bool = False, seed: int = 1) -> dict:

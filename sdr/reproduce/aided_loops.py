@@ -10,10 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
+from monitors.detection import clopper_pearson
 from nav import ultratight_kernels as kernels
 from nav.imu import ImuSpec
 from nav.ultratight import SteeringSpec, discriminator_table
-from sdr.reproduce import clopper_pearson, new_figure, row, save_figure, write_table
+from sdr.figure import new_figure, save_figure
+from sdr.reproduce import row, write_table
 from sdr.uttwin import T_S, Sky, Trial, batch
 from signals.constants import WAVELENGTH_M
 from signals.trajectory import HighDynamics

@@ -11,8 +11,9 @@ import numpy as np
 from monitors import als
 from nav import eskf
 from nav.errormodels import Ecef17
+from sdr.figure import new_figure, save_figure
 from sdr.reproduce import highdynamics as hd
-from sdr.reproduce import new_figure, row, save_figure, write_table
+from sdr.reproduce import row, write_table
 
 N_SATS = 7
 UPPER = np.triu_indices(N_SATS, 1)

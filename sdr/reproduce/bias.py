@@ -11,8 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from monitors import bias_bank as bb
-from sdr.reproduce import clopper_pearson, new_figure, row, save_figure, write_table
+from monitors.detection import clopper_pearson
+from sdr.figure import new_figure, save_figure
 from sdr.reproduce import highdynamics as hd
+from sdr.reproduce import row, write_table
 
 GRID_M = (-10.0, -5.0, 0.0, 5.0, 10.0)
 FIGURES = (

@@ -120,25 +120,6 @@ QUICK = Size(6, QUICK_DB, (), (50, 55), SHORT)
 WHOLE = Size(50, SWEEP_DB, SCALAR_DB, TABLE_DB, LONG)
 
 
-def run(out_dir, quick=False, seed=0) -> list[dict]:
-    """Sweep, table 2, variants, consistency, effective Q and figures into ``out_dir``; whole: also on IF samples.
-
-    Returns the rows. Stopped and called again it goes on with the parts that it has.
-    """
-    from sdr.reproduce import karaim_report as report
-    from sdr.reproduce import write_table
-
-    out = Path(out_dir)
-    size = QUICK if quick else WHOLE
-    cases = twin_cases(size)
-    samples = [] if quick else samples_cases(seed) + nees_cases(seed)
-    results = compute(out / "parts", cases, samples, size, seed)
-    rows = report.rows(results, cases, samples, size)
-    report.figures(out, results, size, samples, seed)
-    write_table(rows, out, "karaim2020")
-    return rows
-
-
 # -- what is run ----------------------------------------------------------------------------------------------------
 
 

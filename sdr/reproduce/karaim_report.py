@@ -7,22 +7,30 @@ from typing import Any
 
 import numpy as np
 
+from monitors.detection import clopper_pearson
 from nav.ultratight import MODES, SteeringSpec
-from sdr.reproduce import clopper_pearson, new_figure, row, save_figure
+from sdr.figure import new_figure, save_figure
+from sdr.reproduce import row, write_table
 from sdr.reproduce.karaim import (
     BANDWIDTH_HZ,
     ITEMS,
+    QUICK,
     RECOVERED_M,
     SAMPLES_JAM_S,
+    WHOLE,
     Case,
     NeesCase,
     Results,
     SamplesCase,
     Size,
+    compute,
     effective_qs,
+    nees_cases,
+    samples_cases,
     sky,
     sweep_name,
     trusting_name,
+    twin_cases,
     unguarded_name,
 )
 from sdr.uttwin import EVERY, T_S, Trial
@@ -43,6 +51,22 @@ TABLE_2 = {
 """Published table 2, in the order of ITEMS."""
 POS2D = ITEMS.index("Pos2D")
 COLORS = {"scalar": "C3", "vector": "C1", "ultra_tight": "C0"}
+
+
+def run(out_dir, quick=False, seed=0) -> list[dict]:
+    """Sweep, table 2, variants, consistency, effective Q and figures into ``out_dir``; whole: also on IF samples.
+
+    Returns the rows. Stopped and called again it goes on with the parts that it has.
+    """
+    out = Path(out_dir)
+    size = QUICK if quick else WHOLE
+    cases = twin_cases(size)
+    samples = [] if quick else samples_cases(seed) + nees_cases(seed)
+    results = compute(out / "parts", cases, samples, size, seed)
+    table = rows(results, cases, samples, size)
+    figures(out, results, size, samples, seed)
+    write_table(table, out, "karaim2020")
+    return table
 
 
 def rows(

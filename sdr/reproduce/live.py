@@ -13,14 +13,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from monitors.detection import clopper_pearson
 from nav import ultratight_kernels as kernels
 from nav.steering import LEFT_OUT, SLOTS, Steering
 from nav.ultratight import Filter, Kinematic, SteeringSpec, extended_q, start_covariance
 from sdr import scenario
+from sdr.figure import new_figure, save_figure
 from sdr.integrity import IntegritySpec
 from sdr.modes import Tee
 from sdr.receiver import Receiver
-from sdr.reproduce import clopper_pearson, new_figure, row, save_figure, write_table
+from sdr.reproduce import row, write_table
 from sdr.respond import RespondSpec
 
 FT = 0.3048

@@ -19,7 +19,8 @@ from monitors.threshold import real_p_fa
 from sdr.campaign.load import from_table, load
 from sdr.campaign.run import execute
 from sdr.campaign.spec import CURVE_EDGES, Campaign
-from sdr.reproduce import new_figure, row, save_figure, within, write_table
+from sdr.figure import new_figure, save_figure
+from sdr.reproduce import row, within, write_table
 from signals.constants import METRES_PER_CHIP, WAVELENGTH_M
 from signals.modulation import SIGNALS
 from signals.multipath import Aeronautical

@@ -14,9 +14,11 @@ import numpy as np
 
 from monitors import noise_rmd
 from monitors import parallel_filters as pf
+from monitors.detection import clopper_pearson
 from nav import eskf
 from nav.errormodels import FOOT_M, Pinson13, measurement_rows, pinson_state, unit_vectors_enu
-from sdr.reproduce import clopper_pearson, new_figure, row, save_figure, write_table
+from sdr.figure import new_figure, save_figure
+from sdr.reproduce import row, write_table
 from signals.range_errors import RangeErrors
 
 GEOMETRY = {

@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 
 from sdr.errors import satellite_truth, tracking_errors
-from sdr.plot import figure
+from sdr.figure import attacks, canvas, figure
 from signals.modulation import SIGNALS
 
 FRONT = "front end"
@@ -20,13 +20,9 @@ def monitors(h5: h5py.File, channels: dict[str, h5py.Group], directory: Path) ->
     names, limits = _watched(h5)
     if not names:
         return None
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     colors = _colors(h5)
     rows = math.ceil(len(names) / COLUMNS)
-    fig = Figure(figsize=(4.2 * min(COLUMNS, len(names)), 0.8 + 2.2 * rows), layout="constrained")
-    FigureCanvasAgg(fig)
+    fig = canvas((4.2 * min(COLUMNS, len(names)), 0.8 + 2.2 * rows))
     fig.suptitle(
         "Monitors: 0 is the quiet median, 1 the threshold; shaded: a jammer is on; grey: never alarmed"
     )
@@ -194,7 +190,5 @@ def _colors(h5: h5py.File) -> dict[tuple[str, str], str]:
 
 
 def _shade(ax: Any, h5: h5py.File) -> None:
-    from sdr.plot import attacks
-
     for begin, end in attacks(h5):
         ax.axvspan(begin, end, color="C3", alpha=0.08, lw=0)
