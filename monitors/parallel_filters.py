@@ -76,6 +76,23 @@ def _restart(j, x, p, age):
 
 
 @njit(cache=True, nogil=True)
+def _alike(use_0, use, test, avail):
+    """Whether a filter tests nobody now and takes what the navigation filter takes."""
+    for i in range(avail.size):
+        if avail[i] and (test[i] or use[i] != use_0[i]):
+            return False
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _same(a, b):
+    for i in range(a.size):
+        if a[i] != b[i]:
+            return False
+    return True
+
+
+@njit(cache=True, nogil=True)
 def bank_step(
     x, p, age, hist, use, test, period, phase, epoch, phi, qd, h, z, var, avail, extra_h, extra_z, extra_var,
     excluded, good, var_at_exclusion, limits, ints, resid, resid_var, stat_long, stat_short,
@@ -97,7 +114,23 @@ def bank_step(
     pf = np.zeros((n, n))
     xf = np.zeros(n)
     n_short, need_good, least, sets, rule = ints[0], ints[1], ints[2], ints[3], ints[4]
+    x0, p0 = x[0].copy(), p[0].copy()
     for f in range(filters):
+        if (
+            f > 0
+            and _alike(use[0], use[f], test[f], avail)
+            and _same(x[f], x0)
+            and _same(p[f].ravel(), p0.ravel())
+        ):
+            # Of a slot that nobody is in: the navigation filter once more.
+            for i in range(m):
+                resid[f, i] = resid_var[f, i] = math.nan
+                if test[f, i]:
+                    hist[f, i, age[f] % window] = 0.0
+            x[f] = x[0]
+            p[f] = p[0]
+            age[f] += 1
+            continue
         xf[:] = np.dot(phi, x[f])
         pf[:] = p[f]
         predict(pf, phi, qd)

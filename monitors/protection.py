@@ -19,7 +19,7 @@ import numpy as np
 from numba import njit
 from pydantic import BaseModel, ConfigDict, Field
 
-from monitors.bias_bank import SINGULAR, chi2_limit
+from monitors.bias_bank import SINGULAR, chi2_limit, whitened_parity
 from nav.eskf import EpochLog
 
 STANFORD = ("available", "misleading", "unavailable", "unavailable misleading", "hazardous")
@@ -156,6 +156,8 @@ def protection_levels(h_enu: np.ndarray, var: np.ndarray, spec: Protection) -> L
     return Levels(hpl, vpl, threshold, dof, sigma, worst, vertical[worst][1])
 
 
+LEAST_SEEN = 10**-4.5
+"""Least sqrt(P_ii) sigma of a satellite whose fault the test may see."""
 SLOPE_STEP = 1.03
 """Slopes are rounded up to this ratio, so that a level is computed once and not every epoch."""
 
@@ -208,30 +210,54 @@ def _unit_level(vertical: bool, k: int, allowed: float, threshold: float, dof: i
     return high
 
 
+@njit(cache=True, nogil=True)
+def steepest(h_enu, var):
+    """(rank, horizontal sigma along its major axis, vertical sigma, and of either the largest slope of a satellite).
+
+    Slope: S_i / sqrt(P_ii) over sigma, infinite where no test sees the satellite; see ``solution``. All is 0 below full rank.
+    """
+    m, q = h_enu.shape
+    parity = np.empty((m, m))
+    rank, _ = whitened_parity(h_enu, var, parity)
+    if rank < q or m <= q:
+        return rank, 0.0, 0.0, 0.0, 0.0
+    weighted = np.ascontiguousarray(h_enu.T) / var
+    cov = np.linalg.inv(np.dot(weighted, h_enu))
+    s = np.dot(cov, weighted)
+    half = 0.5 * (cov[0, 0] - cov[1, 1])
+    major = math.sqrt(0.5 * (cov[0, 0] + cov[1, 1]) + math.hypot(half, cov[0, 1]))
+    up = math.sqrt(cov[2, 2])
+    across, along = 0.0, 0.0
+    for i in range(m):
+        seen = math.sqrt(parity[i, i]) if parity[i, i] > 0.0 else 0.0
+        across = max(
+            across, math.hypot(s[0, i], s[1, i]) / (seen * major) if seen * major > LEAST_SEEN else math.inf
+        )
+        along = max(along, abs(s[2, i]) / (seen * up) if seen * up > LEAST_SEEN else math.inf)
+    return rank, major, up, across, along
+
+
 def quick_levels(h_enu: np.ndarray, var: np.ndarray, spec: Protection) -> tuple[float, float]:
     """(HPL, VPL) as ``protection_levels``, at most ``SLOPE_STEP`` larger, from a table that fills itself.
 
-    With b' = b sqrt(P_ii) the risk of satellite i depends on its slope S_i / sqrt(P_ii) over sigma alone.
+    With b' = b sqrt(P_ii) the risk of satellite i depends on its slope S_i / sqrt(P_ii) over sigma alone, and grows with it.
     """
-    s, cov, parity = solution(h_enu, var)
     m, q = h_enu.shape
-    dof = m - q
-    threshold = chi2_limit(dof, spec.p_false_alarm)
+    rank, major, up, *slopes = steepest(np.ascontiguousarray(h_enu), np.ascontiguousarray(var))
+    if rank < q or m <= q:
+        solution(h_enu, var)
+        return math.inf, math.inf
+    if math.inf in slopes:
+        return math.inf, math.inf
+    threshold = chi2_limit(m - q, spec.p_false_alarm)
     part = 0.5 * spec.p_hmi / spec.independent_epochs / (m + 1)
     allowed = min(part / spec.p_fault, 1.0)
-    up = float(math.sqrt(cov[2, 2]))
-    major = float(np.sqrt(np.linalg.eigvalsh(cov[:2, :2])[-1]))
-    levels_m = []
-    for vertical, sigma, size in ((False, major, np.hypot(s[0], s[1])), (True, up, np.abs(s[2]))):
-        found = math.sqrt(chi2_limit(1 if vertical else 2, part)) * sigma
-        for i in range(m):
-            if parity[i, i] * sigma**2 <= 1e-9:
-                return math.inf, math.inf
-            slope = max(size[i] / (sigma * math.sqrt(parity[i, i])), 1e-3)
-            k = math.ceil(math.log(slope) / math.log(SLOPE_STEP))
-            found = max(found, sigma * _unit_level(vertical, k, allowed, threshold, dof))
-        levels_m.append(found)
-    return levels_m[0], levels_m[1]
+    levels = []
+    for vertical, slope in enumerate(slopes):
+        k = math.ceil(math.log(max(slope, 1e-3)) / math.log(SLOPE_STEP))
+        free = math.sqrt(chi2_limit(2 - vertical, part))
+        levels.append(max(free, _unit_level(bool(vertical), k, allowed, threshold, m - q)))
+    return levels[0] * major, levels[1] * up
 
 
 @njit(cache=True, nogil=True)

@@ -44,8 +44,25 @@ class Remedy(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def record(at, los, second, innovation, variance, own, used, z, h, own_all, seen, r_used, h_used, var, took):
-    """One update into the rows of its slots ``at`` (n,), -1: none; see ``NavigatorLog.updated``. Outputs have 2S rows."""
+def propagate(total_phi, total_qd, prior, p, dt_s, accel_psd, clock_f, clock_g, isb_psd):
+    """One propagation of the navigator's filter by ``dt_s`` to ``p`` (``kernels.pvt_predict``) into the log's sums."""
+    n = p.shape[0]
+    phi, qd = np.eye(n), np.zeros((n, n))
+    kernels.pvt_predict(np.zeros(n), qd, dt_s, accel_psd, clock_f, clock_g, isb_psd)
+    phi[0, 3] = phi[1, 4] = phi[2, 5] = phi[6, 7] = dt_s
+    eskf_kernels.chain(total_phi, total_qd, phi, qd)
+    prior[:] = p
+
+
+@njit(cache=True, nogil=True)
+def record(
+    at, los, second, innovation, variance, own, used, z, h, own_all, seen, total_phi, total_qd, prior, phi, qd, p, r_used,
+    h_used, k, s, var, took,
+):  # fmt: skip
+    """One update into the rows of its slots ``at`` (n,), -1: none; see ``NavigatorLog.updated``. Outputs have 2S rows.
+
+    ``total_*``, ``prior`` (n, n) from ``propagate`` go into the log's ``phi``, ``qd``, ``p`` and begin anew.
+    """
     n, slots = at.size, z.size // 2
     for array in (z, r_used):
         array[:] = 0.0
@@ -63,6 +80,10 @@ def record(at, los, second, innovation, variance, own, used, z, h, own_all, seen
                 h[row, 8] = second[i]
             if used[mine] > 0:
                 took[row], r_used[row], h_used[row] = True, z[row], h[row]
+    phi[:], qd[:], p[:] = total_phi, total_qd, prior
+    eskf_kernels.innovation_covariance(prior, h_used, var, took, s)
+    eskf_kernels.update(prior, h_used, var, took, r_used, k, np.empty(prior.shape[0]))
+    total_phi[:], total_qd[:] = np.eye(prior.shape[0]), 0.0
 
 
 class NavigatorLog:
@@ -85,7 +106,7 @@ class NavigatorLog:
         self.z, self.h, self.own = np.zeros(m), np.zeros((m, n)), np.ones(m)
         self.seen, self.dx = np.zeros(m, np.bool_), np.zeros(n)
         self._phi, self._qd = np.eye(n), np.zeros((n, n))
-        self._prior, self._unit = np.zeros((n, n)), np.eye(n)
+        self._prior = np.zeros((n, n))
         self._named, self._at = list[str](), np.zeros(0, np.int64)
 
     def restart(self) -> None:
@@ -98,14 +119,8 @@ class NavigatorLog:
 
     def predicted(self, dt_s: float, p: np.ndarray, spec) -> None:
         """The filter was propagated by ``dt_s`` to covariance ``p``; ``spec`` a FilterSpec."""
-        n = kernels.N_EKF
-        qd, unused = np.zeros((n, n)), np.zeros(n)
         noise = spec.accel_psd_m2_s3, spec.clock_f_m2_s, spec.clock_g_m2_s3, spec.isb_psd_m2_s
-        kernels.pvt_predict(unused, qd, dt_s, *noise)
-        phi = self._unit.copy()
-        phi[[0, 1, 2, 6], [3, 4, 5, 7]] = dt_s
-        eskf_kernels.chain(self._phi, self._qd, phi, qd)
-        self._prior[:] = p
+        propagate(self._phi, self._qd, self._prior, p, dt_s, *noise)
 
     def slot(self, name: str) -> int:
         """Slot of a satellite, a new one if need be; -1 when all are taken."""
@@ -125,16 +140,13 @@ class NavigatorLog:
         if names != self._named:
             self._named, self._at = list(names), np.array([self.slot(name) for name in names], dtype=np.int64)
         log = self._views[self.count % self.length]
-        log.t_s[...], log.phi[:], log.qd[:], log.p[:] = t_s, self._phi, self._qd, self._prior
+        log.t_s[...] = t_s
         record(
-            self._at, los, second, innovation, variance, own, used, self.z, self.h, self.own, self.seen, log.r, log.h, log.var,
-            log.used,
+            self._at, los, second, innovation, variance, own, used, self.z, self.h, self.own, self.seen, self._phi, self._qd,
+            self._prior, log.phi, log.qd, log.p, log.r, log.h, log.k, log.s, log.var, log.used,
         )  # fmt: skip
-        eskf_kernels.innovation_covariance(self._prior, log.h, log.var, log.used, log.s)
-        eskf_kernels.update(self._prior, log.h, log.var, log.used, log.r, log.k, np.empty_like(dx))
         self.dx = dx
         self.count += 1
-        self._phi[:], self._qd[:] = self._unit, 0.0
 
     def last(self) -> EpochLog:
         """The last epoch (views)."""
