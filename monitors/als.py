@@ -1,4 +1,4 @@
-"""Measurement-noise covariance from the innovations of a running filter: autocovariance least squares (seed 000).
+"""Measurement-noise covariance from the innovations of a running filter: autocovariance least squares (Abdel-Hafez ALS).
 
 The gains in the epoch log do not depend on the noise that is sought, so the covariance of the innovations at lags 0..N-1
 is *linear* in it. With Abar_k = phi_{k+1} (I - K_k H_k), L_k = phi_{k+1} K_k and R = sum_i theta_i E_i:
@@ -10,7 +10,7 @@ is *linear* in it. With Abar_k = phi_{k+1} (I - K_k H_k), L_k = phi_{k+1} K_k an
     E[r_{k+j} r_k'] = H_{k+j} Abar_{k+j-1} .. Abar_{k+1} C_k,   C_k = Abar_k P_k H_k' - L_k R
 
 averaged over the same epochs as the data and solved by non-negative (diagonal R) or plain (symmetric R) least squares.
-Odelson, Rajamani and Rawlings 2006 give the time-invariant form; seed 000, eq. 16, freezes the matrices at one epoch,
+Odelson, Rajamani and Rawlings 2006 give the time-invariant form; Abdel-Hafez ALS, eq. 16, freezes the matrices at one epoch,
 which needs a stable phi (I - K H): it is not, see ``frozen``. The measurement noise must be white: feed discriminator
 outputs, one per integration, not smoothed pseudoranges.
 """
@@ -260,7 +260,7 @@ def als_model(
 
 
 def autocovariance(r: np.ndarray, used: np.ndarray, n_lags: int, settle: int) -> np.ndarray:
-    """Sample lagged covariances (N, p, p) of innovations (E, p), mean of r_{k+j} r_k' (seed 000, eq. 15)."""
+    """Sample lagged covariances (N, p, p) of innovations (E, p), mean of r_{k+j} r_k' (Abdel-Hafez ALS, eq. 15)."""
     y = np.where(used, r, 0.0)[settle:]
     w = used[settle:].astype(np.float64)
     out = np.empty((n_lags, r.shape[1], r.shape[1]))
@@ -328,7 +328,7 @@ def uncompensated(log: EpochLog, rows: np.ndarray | None = None, settle: int = 1
 
 @dataclass(frozen=True)
 class FrozenAls:
-    """The printed form (seed 000, eq. 16) with the matrices frozen at one epoch: a labelled comparison, not for use."""
+    """The printed form (Abdel-Hafez ALS, eq. 16) with the matrices frozen at one epoch: a labelled comparison, not for use."""
 
     r_cov_m2: np.ndarray
     spectral_radius: float
@@ -336,7 +336,7 @@ class FrozenAls:
 
 
 def frozen(log: EpochLog, sample: np.ndarray, index: int = -1) -> FrozenAls:
-    """Seed 000, eq. 16-17, with phi, K, H frozen at epoch ``index``; ``sample`` (N, m, m) as in ``autocovariance``.
+    """Abdel-Hafez ALS, eq. 16-17, with phi, K, H frozen at epoch ``index``; ``sample`` (N, m, m) as in ``autocovariance``.
 
     Solves (I - phibar kron phibar) for every unknown, which is singular up to rounding whenever the spectral radius of
     phibar = phi (I - K H) is 1 or more; both figures are returned. All rows must be used; the solution is full and

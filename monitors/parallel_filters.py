@@ -1,4 +1,4 @@
-"""Bank of parallel Kalman filters against offsets of single satellites (seed 001), compiled as one call per epoch.
+"""Bank of parallel Kalman filters against offsets of single satellites (Vanek 1999), compiled as one call per epoch.
 
 A navigation filter uses every healthy satellite. Detection filters leave one out, the satellite under test: its
 residual, against what the others predict, is summed as chi = sum r^2 / A over a window (A = h P h' + R). Three filters
@@ -315,11 +315,11 @@ def rmd_monte_carlo(v, v2, sigma, scheme, decay, divisor, window, out):
 
 
 class ParallelFilters(BaseModel):
-    """Scenario section of the bank (seed 001, table 1: period 18, three staggered, sum over 18, threshold 64).
+    """Scenario section of the bank (Vanek 1999, table 1: period 18, three staggered, sum over 18, threshold 64).
 
     ``short_threshold`` is off (infinite) unless given; ``recertify_windows`` 0 = a failed satellite stays out.
     ``recertify_growth`` bounds how much A may have grown since the exclusion: as A grows after the loss of a satellite, a
-    constant offset looks ever more harmless (seed 001, section 3.6.5).
+    constant offset looks ever more harmless (Vanek 1999, section 3.6.5).
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")

@@ -19,7 +19,7 @@ GYRO_DEG_RT_H = 1.0 / 3437.746770784939
 """1 deg/rt-h in rad/rt-s: pi/180/60."""
 FOOT_M = 0.3048
 EQUATORIAL_GRAVITY_MPS2 = 32.08744 * FOOT_M
-"""g_o of seed 001, appendix A (ft/s^2 converted)."""
+"""g_o of Vanek 1999, appendix A (ft/s^2 converted)."""
 
 EARTH_RATE_ECEF = np.array([0.0, 0.0, EARTH_RATE_RAD_S])
 
@@ -103,7 +103,7 @@ def ecef17_f(pos_ecef_m, c_be, specific_force_body_mps2, accel_rate, gyro_rate, 
 
 
 class Ecef17(BaseModel):
-    """17 states in ECEF: dp dv psi dba dbg b d (seeds 000 and 002, equations 1-3 linearised).
+    """17 states in ECEF: dp dv psi dba dbg b d (Abdel-Hafez, both papers, equations 1-3 linearised).
 
     The noise strengths are not in the seeds; the defaults are a tactical-grade IMU and a TCXO-like clock.
     """
@@ -213,7 +213,7 @@ def pinson_state(lat_rad, lon_rad, height_m, vel_enu_mps, c_bn=None) -> PinsonSt
 
 @njit(cache=True, nogil=True)
 def pinson13_f(c_en, radii_m, v, force_n, baro_rate, baro_gain, damped, coupling, f):
-    """F of the Pinson model into ``f`` (13, 13), seed 001, appendix A.1, wander azimuth (rho_z = 0).
+    """F of the Pinson model into ``f`` (13, 13), Vanek 1999, appendix A.1, wander azimuth (rho_z = 0).
 
     ``radii_m`` (R_M + h, R_N + h); ``v``, ``force_n`` (3,) velocity and specific force in the navigation frame; ``damped`` 1 or 0 times -gain on the height,
     ``coupling`` +-1 times gain from the barometer's error to it. The change of rho with height, V/R^2 dh, is left out as in
@@ -248,7 +248,7 @@ def pinson13_f(c_en, radii_m, v, force_n, baro_rate, baro_gain, damped, coupling
 
 
 class Pinson13(BaseModel):
-    """13 states of seed 001 (eq. 42, appendix A): dtheta(3) phi(3) dV(3) dh dhB b d, in SI units.
+    """13 states of Vanek 1999 (eq. 42, appendix A): dtheta(3) phi(3) dV(3) dh dhB b d, in SI units.
 
     Signs. ``form="feedforward"`` is the seed's: INS error = INS - true, clock and barometer errors as they are, range
     row +u (eq. 51), barometer row [dh - dhB] for h_INS - h_baro (eq. 46). ``form="feedback"`` is the project's
@@ -311,7 +311,7 @@ class Pinson13(BaseModel):
         return f
 
     def q_diag(self) -> np.ndarray:
-        """Diagonal of Qc (13,), seed 001, appendix A.2."""
+        """Diagonal of Qc (13,), Vanek 1999, appendix A.2."""
         q = np.zeros(13)
         q[0:2], q[2] = self.q_theta_xy_rad2_s, self.q_theta_z_rad2_s
         q[3:6], q[6:9] = self.q_gyro_rad2_s, self.q_accel_m2_s3
@@ -364,7 +364,7 @@ def measurement_rows(model, nominal, u_ecef: np.ndarray, rate: bool = False) -> 
     """Range rows (m, n) of ``u_ecef`` (m, 3), unit vectors receiver -> satellite; with ``rate``, range-rate rows.
 
     row = -u' T_p + e_b, or -u' T_v + e_d, for error states true - estimate; in the Pinson feedforward form the
-    inertial part changes sign (seed 001, eq. 51).
+    inertial part changes sign (Vanek 1999, eq. 51).
     """
     t = model.vel_map(nominal) if rate else model.pos_map(nominal)
     sign = 1.0 if getattr(model, "form", "feedback") == "feedforward" else -1.0

@@ -37,7 +37,7 @@ def earth_radii(lat_rad):
 
 @njit(cache=True, nogil=True)
 def ecef_from_geodetic(lat_rad, lon_rad, height_m):
-    """ECEF position (3,) of a geodetic point (seed 003, eq. 31-33)."""
+    """ECEF position (3,) of a geodetic point (Karaim 2020, eq. 31-33)."""
     _, rn = earth_radii(lat_rad)
     out = np.empty(3)
     out[0] = (rn + height_m) * math.cos(lat_rad) * math.cos(lon_rad)
@@ -66,7 +66,7 @@ def geodetic_from_ecef(pos_ecef_m):
 
 @njit(cache=True, nogil=True)
 def rotation_enu_to_ecef(lat_rad, lon_rad):
-    """R_l^e (3, 3): columns are the east, north and up unit vectors in ECEF (seed 003, eq. 41)."""
+    """R_l^e (3, 3): columns are the east, north and up unit vectors in ECEF (Karaim 2020, eq. 41)."""
     sp, cp, sl, cl = math.sin(lat_rad), math.cos(lat_rad), math.sin(lon_rad), math.cos(lon_rad)
     r = np.empty((3, 3))
     r[0, 0], r[0, 1], r[0, 2] = -sl, -sp * cl, cp * cl
@@ -90,7 +90,7 @@ def rotation_ned_to_ecef(lat_rad, lon_rad):
 def position_map_geodetic(lat_rad, lon_rad, height_m):
     """T (3, 3) with d(ECEF) = T d(lat, lon, height); (R_M + h) in the whole latitude column.
 
-    Seed 003, eq. 34, prints (R_N + h) in the x and y rows: 0.35 % off; the derivative of eq. 31-33 has R_M.
+    Karaim 2020, eq. 34, prints (R_N + h) in the x and y rows: 0.35 % off; the derivative of eq. 31-33 has R_M.
     """
     rm, rn = earth_radii(lat_rad)
     r = rotation_enu_to_ecef(lat_rad, lon_rad)

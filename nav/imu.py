@@ -47,7 +47,7 @@ GRADES = {
     },
 }  # fmt: skip
 """Grades of IMU. navigation, tactical, consumer: typical of Groves 2013, table 4.1 and data sheets of the
-class; consumer is quantised to 16 bits (+-500 deg/s, +-6 g at 100 Hz). karaim2020: table 1 of seed 003,
+class; consumer is quantised to 16 bits (+-500 deg/s, +-6 g at 100 Hz). karaim2020: table 1 of Karaim 2020,
 whose accelerometer bias "1 deg/h" is read as 1 mg; scale, misalignment and turn-on biases are not stated
 there."""
 
@@ -122,7 +122,7 @@ class ImuSpec(BaseModel):
 class OdometerSpec(BaseModel):
     """Section ``[odometer]``: wheel speed = true speed / (1 - scale) + noise, scale a Gauss-Markov process.
 
-    Rate, noise and correlation time are seed 003's; it does not state the size of the scale factor error.
+    Rate, noise and correlation time are those of Karaim 2020; it does not state the size of the scale factor error.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -140,7 +140,7 @@ class OdometerSpec(BaseModel):
 class BarometerSpec(BaseModel):
     """Section ``[sensors.barometer]``: height + Gauss-Markov bias (the weather) + white noise.
 
-    Size and correlation time of the bias are seed 001's (100 ft, 600 s; appendix A.2).
+    Size and correlation time of the bias are Vanek's (100 ft, 600 s; appendix A.2).
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")

@@ -1,6 +1,6 @@
 """Reduced inertial sensor system (RISS): one gyro, two accelerometers, the odometer; error models.
 
-Mechanisation of seed 003, eq. 1-10, with the signs that the extraction lost:
+Mechanisation of Karaim 2020, eq. 1-10, with the signs that our copy of it lacks:
 
     A'  = -[(wz - bz) - w_e sin(phi) - v_e tan(phi) / (R_N + h)]
     p   =  asin((f_y - a_o) / g),   r = -asin((f_x + v_o (wz - bz)) / (g cos p))
@@ -173,7 +173,7 @@ def riss_run(x, form, wz, fy, fx, speed, dt_s, filter_s, out):
 
 @njit(cache=True, nogil=True)
 def riss11_f(x, wz, accel_rate, gyro_rate, f):
-    """F (11, 11) of seed 003, eq. 12-25, into ``f``; ``accel_rate`` and ``gyro_rate`` are 1/correlation time.
+    """F (11, 11) of Karaim 2020, eq. 12-25, into ``f``; ``accel_rate`` and ``gyro_rate`` are 1/correlation time.
 
     Printed T17,7 in the vn row is T17,4 (the gyro bias); signs by numerical Jacobian.
     """
@@ -280,7 +280,7 @@ class _Riss(BaseModel):
         return out
 
     def pos_map(self, x):
-        """T_p (3, n) to ECEF: (R_M + h) in the latitude column, where seed 003, eq. 34, has (R_N + h)."""
+        """T_p (3, n) to ECEF: (R_M + h) in the latitude column, where Karaim 2020, eq. 34, has (R_N + h)."""
         t = np.zeros((3, self.n))
         t[:, :3] = position_map_geodetic(x[LAT], x[LON], x[HEIGHT])
         return t
@@ -295,7 +295,7 @@ def _set_velocity(x):
 
 
 class Riss11(_Riss):
-    """Seed 003's 11 states: dphi dlam dh dve dvn dvu dA dao dbz b d, velocity integrated (``PAPER``).
+    """Karaim's 11 states: dphi dlam dh dve dvn dvu dA dao dbz b d, velocity integrated (``PAPER``).
 
     Gyro and odometer errors as first-order Gauss-Markov processes (eq. 19, 20); white noise only there and
     on the clock drift, as printed (the expanded vector's 0 in place of sigma_d is a misprint).

@@ -1,6 +1,6 @@
 """Strapdown mechanisation in ECEF, and initial alignment.
 
-p' = v,  v' = C_be f^b - 2 w_ie x v + g(p),  C_be' = C_be [w_eb^b x]   (seeds 000 and 002, eq. 1-3; the
+p' = v,  v' = C_be f^b - 2 w_ie x v + g(p),  C_be' = C_be [w_eb^b x]   (Abdel-Hafez, both papers, eq. 1-3; the
 attitude is carried as a matrix and turned by exact rotation vectors, so that no quaternion normalisation
 enters).
 """

@@ -42,7 +42,7 @@ EVERY = 5
 
 
 def drive(duration_s=600.0, speed_mps=10.0, **place) -> Segments:
-    """A land drive at constant speed (seed 003: 36 km/h), straights of 30 s and right and left turns of 90 deg in 12 s."""
+    """A land drive at constant speed (Karaim 2020: 36 km/h), straights of 30 s and right and left turns of 90 deg in 12 s."""
     turns, t = (1, 1, -1, 1, -1, -1), 0.0
     segment: list[Segment] = []
     while t < duration_s:

@@ -74,6 +74,6 @@ def attitude(
 
 
 def specific_force_ecef(pos_ecef_m, vel_ecef_mps, acc_ecef_mps2, gravity_ecef_mps2):
-    """f^e = a^e - g^e + 2 w_ie x v^e, (m, 3): what accelerometers feel (seeds 000 and 002, eq. 2)."""
+    """f^e = a^e - g^e + 2 w_ie x v^e, (m, 3): what accelerometers feel (Abdel-Hafez, both papers, eq. 2)."""
     w = np.array([0.0, 0.0, EARTH_RATE_RAD_S])
     return acc_ecef_mps2 - gravity_ecef_mps2 + 2.0 * np.cross(w, vel_ecef_mps)

@@ -1,4 +1,4 @@
-"""Slow errors of code ranges as first-order Gauss-Markov processes: the truth-model option of seed 001, appendix B.
+"""Slow errors of code ranges as first-order Gauss-Markov processes: the truth-model option of Vanek 1999, appendix B.
 
 Each process has variance s^2 and correlation time tau, so its driving noise is q = 2 s^2 / tau. Two printed strengths
 contradict their own variances and are corrected so: multipath (eq. 75: 0.2, must be 0.8 ft^2/s) and ephemeris (eq. 81:
@@ -14,7 +14,7 @@ _FT2 = 0.3048**2
 
 
 class RangeErrors(BaseModel):
-    """Variances (m^2) and correlation times (s); defaults are seed 001, eq. 65-82, converted from feet.
+    """Variances (m^2) and correlation times (s); defaults are Vanek 1999, eq. 65-82, converted from feet.
 
     ``multipath_positive`` folds the multipath error to delays only (section B.6).
     """

@@ -1,4 +1,4 @@
-"""Textbook twin of the parallel filter bank: one Kalman filter object per filter, written from seed 001's text."""
+"""Textbook twin of the parallel filter bank: one Kalman filter object per filter, written from Vanek's text."""
 
 import numpy as np
 

@@ -15,7 +15,7 @@ RATE = 100
 
 
 def drive(duration_s, speed_mps=10.0, climb=True):
-    """36 km/h with 90 deg turns every half minute and gentle slopes (seed 003's drive, its course
+    """36 km/h with 90 deg turns every half minute and gentle slopes (Karaim's drive, its course
     assumed)."""
     legs = []
     for k in range(int(duration_s // 30) + 2):

@@ -1,4 +1,4 @@
-"""The reproduction of seed 003: its parts survive an interruption, Q against a correlation, table 2, acceptance ranges."""
+"""The reproduction of Karaim 2020: its parts survive an interruption, Q against a correlation, table 2, acceptance ranges."""
 
 import csv
 import json

@@ -1,4 +1,4 @@
-"""Parallel filter bank: textbook twin, seed 001's acceptance numbers, sequential failures, re-certification, refusals."""
+"""Parallel filter bank: textbook twin, Vanek's acceptance numbers, sequential failures, re-certification, refusals."""
 
 import math
 import time

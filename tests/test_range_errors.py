@@ -1,4 +1,4 @@
-"""Appendix B of seed 001: stationary variances, correlation times, and the two corrected strengths."""
+"""Appendix B of Vanek 1999: stationary variances, correlation times, and the two corrected strengths."""
 
 import numpy as np
 import pytest

@@ -183,7 +183,7 @@ def coast(model, p0, runs, duration_s=210.0, aid_s=120.0, odometer=None, seed=7)
 
 
 def test_coasting_90_s_after_120_s_of_aiding():
-    """Seed 003's sensors (10 deg/h, 1 deg/rt-h, odometer 1 cm/s and 1 h): 0.5 to 2 m RMS, and the claim is
+    """Karaim's sensors (10 deg/h, 1 deg/rt-h, odometer 1 cm/s and 1 h): 0.5 to 2 m RMS, and the claim is
     honest.
 
     The end error of 8 runs has 2 x 8 degrees of freedom, so that its RMS is within a factor 1 +-

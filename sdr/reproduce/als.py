@@ -1,4 +1,4 @@
-"""Seed 000 (Abdel-Hafez, autocovariance least squares) on the exact linear model of the ultra-tight filter.
+"""Abdel-Hafez, autocovariance least squares, on the exact linear model of the ultra-tight filter.
 
 The seed shows its results in figures without numbers: 10 m and 30 m noise, N = 1 ("very close ... small offset") and
 N = 2 ("right on the true simulated standard deviation"), off-diagonals "much closer to being zero in mean" with N = 2.
@@ -236,7 +236,7 @@ def figures(out: Path, kept: dict, off: dict, n_d: int, unequal: tuple) -> None:
     for i, name in enumerate(("east", "north", "up")):
         axes[i].plot(t, hd.acceleration_enu(t)[:, i])
         axes[i].set_ylabel(f"{name}, m/s$^2$")
-    axes[0].set_title("Seed 000 fig. 2: acceleration profile (amplitudes and periods assumed)")
+    axes[0].set_title("Abdel-Hafez ALS fig. 2: acceleration profile (amplitudes and periods assumed)")
     axes[2].set_xlabel("time, s")
     save_figure(fig, out, "fig02_acceleration")
     for sigma, n_lags, diag_fig, off_fig in ((10, 1, 3, 4), (10, 2, 5, 6), (30, 1, 7, 8), (30, 2, 9, 10)):
@@ -253,7 +253,7 @@ def figures(out: Path, kept: dict, off: dict, n_d: int, unequal: tuple) -> None:
         axes.flat[0].legend(fontsize=7)
         axes.flat[7].axis("off")
         fig.suptitle(
-            f"Seed 000 fig. {diag_fig}: {sigma} m noise, sqrt(diag R-hat) per residual bank, {label}, m"
+            f"Abdel-Hafez ALS fig. {diag_fig}: {sigma} m noise, sqrt(diag R-hat) per residual bank, {label}, m"
         )
         save_figure(fig, out, f"fig{diag_fig:02d}_diagonal")
         fig, ax = new_figure(1, 1, size=(9, 4.5))
@@ -263,7 +263,7 @@ def figures(out: Path, kept: dict, off: dict, n_d: int, unequal: tuple) -> None:
         ax.set_xticks(x, [f"{a + 1},{b + 1}" for a, b in zip(*UPPER)], rotation=90, fontsize=7)
         ax.axhline(0, color="k", lw=1)
         ax.legend()
-        ax.set_title(f"Seed 000 fig. {off_fig}: {sigma} m noise, mean off-diagonal estimates, m$^2$")
+        ax.set_title(f"Abdel-Hafez ALS fig. {off_fig}: {sigma} m noise, mean off-diagonal estimates, m$^2$")
         save_figure(fig, out, f"fig{off_fig:02d}_offdiagonal")
     truth, first, second = unequal
     fig, ax = new_figure(1, 1, size=(8, 4.5))
@@ -280,7 +280,7 @@ def figures(out: Path, kept: dict, off: dict, n_d: int, unequal: tuple) -> None:
 
 
 def run(out_dir: str | Path, quick: bool = False, seed: int = 1) -> list[dict]:
-    """Reproduce seed 000; writes figures and als.csv / als.json into ``out_dir`` and returns the rows."""
+    """Reproduce the paper; writes figures and als.csv / als.json into ``out_dir`` and returns the rows."""
     out = Path(out_dir)
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(0,)))
     runs, n_d = (40, 300) if quick else (200, 500)

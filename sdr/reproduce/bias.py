@@ -1,4 +1,4 @@
-"""Seed 002 (Abdel-Hafez, bias bank) in the measurement domain: the filter's error is projected out, so it is exact.
+"""Abdel-Hafez, bias bank, in the measurement domain: the filter's error is projected out, so it is exact.
 
 Figures 3-10 of the seed show the probabilities of the hypotheses 0, 5 and 10 m on the biased satellite: covariance 1
 (second satellite), 2.1 and 12.5 (third satellite), true biases 10, 7 and 20 m. Numbers are not printed; the text says
@@ -224,7 +224,7 @@ def figures(out: Path, kept: dict, again: dict) -> None:
     for i, name in enumerate(("east", "north", "up")):
         axes[i].plot(t, hd.acceleration_enu(t)[:, i])
         axes[i].set_ylabel(f"{name}, m/s$^2$")
-    axes[0].set_title("Seed 002 fig. 2: acceleration profile (amplitudes and periods assumed)")
+    axes[0].set_title("Abdel-Hafez bias fig. 2: acceleration profile (amplitudes and periods assumed)")
     axes[2].set_xlabel("time, s")
     save_figure(fig, out, "fig02_acceleration")
     for number, var, bias, sat in FIGURES:
@@ -238,7 +238,7 @@ def figures(out: Path, kept: dict, again: dict) -> None:
             ax.set_ylabel(f"P({hypothesis:g} m)")
             ax.set_ylim(-0.03, 1.03)
         axes[0].set_title(
-            f"Seed 002 fig. {number}: {bias:g} m on satellite {sat + 1}, cov {var:g} (one run; grey: 20 runs)"
+            f"Abdel-Hafez bias fig. {number}: {bias:g} m on satellite {sat + 1}, cov {var:g} (one run; grey: 20 runs)"
         )
         axes[2].set_xlabel("epoch")
         save_figure(fig, out, f"fig{number:02d}_probability")
@@ -253,7 +253,7 @@ def figures(out: Path, kept: dict, again: dict) -> None:
 
 
 def run(out_dir: str | Path, quick: bool = False, seed: int = 1) -> list[dict]:
-    """Reproduce seed 002; writes figures and bias.csv / bias.json into ``out_dir`` and returns the rows."""
+    """Reproduce the paper; writes figures and bias.csv / bias.json into ``out_dir`` and returns the rows."""
     out = Path(out_dir)
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(2,)))
     runs = 200 if quick else 2000

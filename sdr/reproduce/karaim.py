@@ -1,4 +1,4 @@
-"""Seed 003 (Karaim et al. 2020): scalar, vector and ultra-tight GPS/RISS through 90 s of jamming.
+"""Karaim et al. 2020: scalar, vector and ultra-tight GPS/RISS through 90 s of jamming.
 
 The paper gives neither J/S, C/N0, loop settings, R policy nor geometry. Here J/S is swept on the multi-satellite twin, and the
 table is set beside the J/S at which our vector receiver is as bad as the published one; then the three receivers run on

@@ -1,4 +1,4 @@
-"""Rows and figures of the reproduction of seed 003: the sweep, table 2, claims, variants, consistency, IF samples."""
+"""Rows and figures of the reproduction of Karaim 2020: the sweep, table 2, claims, variants, consistency, IF samples."""
 
 import csv
 import math

@@ -1,4 +1,4 @@
-"""Ouzeau, Macabiau, Roturier, Mabilleau, ION NTM 2008 (seed 004): detection of CW and NBI on multicorrelator outputs.
+"""Ouzeau, Macabiau, Roturier, Mabilleau, ION NTM 2008: detection of CW and NBI on multicorrelator outputs.
 
 Everything is counted by campaigns of the correlator-domain twin, whose results files stay beside the figures and are
 gone on with if a run is stopped. What the source leaves open (early-late spacing, FFT input, which epochs its P_MD
@@ -116,7 +116,7 @@ def line_rows(out: Path) -> list[dict]:
     for prn in (2, 10):
         khz, db = level_db("L1CA", prn)
         rows.append(row(f"L1CA PRN {prn}: level of its worst line, dB", None, db, note=f"at {khz:g} kHz"))
-    fig.suptitle("Seed 004 fig. 3, 4: worst code lines by PRN")
+    fig.suptitle("Ouzeau 2008 fig. 3, 4: worst code lines by PRN")
     save_figure(fig, out, "fig03_04_lines")
     return rows
 
@@ -209,7 +209,7 @@ def _error_figure(out: Path, name: str, t_s: np.ndarray, phase: np.ndarray, code
     axes[1].plot(t_s[::step], smooth[::step], "k", lw=1, label="100-s smoothed")
     axes[1].legend(fontsize=7)
     axes[-1].set_xlabel("time (s)")
-    fig.suptitle(f"Seed 004 fig. 5-7: {name}, CW of -155 dBW parked on the worst line")
+    fig.suptitle(f"Ouzeau 2008 fig. 5-7: {name}, CW of -155 dBW parked on the worst line")
     save_figure(fig, out, f"fig05_07_errors_{name.lower()}")
 
 
@@ -274,7 +274,7 @@ def null_rows(out: Path, seed: int, quick: bool) -> list[dict]:
             xlabel="(maximum - mean) / standard deviation",
             ylabel="density",
         )
-    fig.suptitle("Seed 004 fig. 8: distribution of the criterion without interference")
+    fig.suptitle("Ouzeau 2008 fig. 8: distribution of the criterion without interference")
     save_figure(fig, out, "fig08_null")
     return rows
 
@@ -614,7 +614,7 @@ def _pilot_rows(bench: _Bench) -> list[dict]:
 
 
 def run(out_dir: str | Path, quick: bool = False, seed: int = 1) -> list[dict]:
-    """Reproduce seed 004; writes figures, campaigns and ouzeau.csv / ouzeau.json into ``out_dir``; returns the rows."""
+    """Reproduce the paper; writes figures, campaigns and ouzeau.csv / ouzeau.json into ``out_dir``; returns the rows."""
     out = Path(out_dir)
     out.mkdir(parents=True, exist_ok=True)
     bench = _Bench(out, quick, seed)

@@ -1,4 +1,4 @@
-"""Seed 001 (Vanek 1999, parallel Kalman filters) on its own 13-state linear model, in feet.
+"""Vanek 1999, parallel Kalman filters, on its own 13-state linear model, in feet.
 
 Four satellites, 1 Hz, runs of 250 s, detection from 150 s, faults from 200 s. The thesis does not give the satellite
 geometry, the barometer's noise, speed or latitude. The geometry used here is the one of 22 random ones that fits its
@@ -482,7 +482,7 @@ def figures(out: Path, s: Scene, kept: dict, noise: dict, seed: int) -> None:
         claimed = np.sqrt(np.nanmean(quiet.resid_var[:, w, f], axis=0)) / FOOT_M
         axes[f].plot(T_AXIS[w], claimed, "k", T_AXIS[w], -claimed, "k")
         axes[f].set_ylabel(f"filter {f + 1}, ft", fontsize=8)
-    fig.suptitle("Seed 001 fig. 3: reset timing, +- claimed sigma of the residual, nominal operation")
+    fig.suptitle("Vanek 1999 fig. 3: reset timing, +- claimed sigma of the residual, nominal operation")
     save_figure(fig, out, "fig03_reset_timing")
     sigma = case_i_sigma()
     fig, axes = new_figure(4, 1, size=(8, 8), sharex=True)
@@ -492,13 +492,13 @@ def figures(out: Path, s: Scene, kept: dict, noise: dict, seed: int) -> None:
         axes[i].plot(T_AXIS[w], sigma[w, i], "k", T_AXIS[w], mean, "x", ms=3)
         axes[i].plot(T_AXIS[w], mean + sd, "C0--", T_AXIS[w], mean - sd, "C0--", lw=0.7)
         axes[i].set_ylabel(f"SV {i + 1}, ft", fontsize=8)
-    fig.suptitle("Seed 001 fig. 4, Case I: true and estimated noise sigma, N_R = 10 (levels assumed)")
+    fig.suptitle("Vanek 1999 fig. 4, Case I: true and estimated noise sigma, N_R = 10 (levels assumed)")
     save_figure(fig, out, "fig04_noise_estimate")
-    error_figure(out, "fig05_case1_errors", "Seed 001 fig. 5, Case I", s, noise)
-    residual_figure(out, "fig06_nominal", "Seed 001 fig. 6, Case II: nominal", quiet)
-    error_figure(out, "fig07_nominal_errors", "Seed 001 fig. 7, Case II: nominal", s, {"adaptive": quiet})
+    error_figure(out, "fig05_case1_errors", "Vanek 1999 fig. 5, Case I", s, noise)
+    residual_figure(out, "fig06_nominal", "Vanek 1999 fig. 6, Case II: nominal", quiet)
+    error_figure(out, "fig07_nominal_errors", "Vanek 1999 fig. 7, Case II: nominal", s, {"adaptive": quiet})
     merit_figure(
-        out, "fig07_nominal_merit", "Seed 001 fig. 7: mean figure of merit", {"nominal": quiet}, ((0, None),)
+        out, "fig07_nominal_merit", "Vanek 1999 fig. 7: mean figure of merit", {"nominal": quiet}, ((0, None),)
     )
     plots = (
         (8, 9, 10, 11, "Table 2 step", STEPS, 22, step_fault, None, "22 ft step"),
@@ -518,7 +518,7 @@ def figures(out: Path, s: Scene, kept: dict, noise: dict, seed: int) -> None:
     )
     for a, b, c, d, table, cases, size, make, sg, label in plots:
         o = kept[table, size]
-        residual_figure(out, f"fig{a:02d}_residuals", f"Seed 001 fig. {a}: {label} at 200 s", o)
+        residual_figure(out, f"fig{a:02d}_residuals", f"Vanek 1999 fig. {a}: {label} at 200 s", o)
         child = np.random.SeedSequence(seed, spawn_key=(5, a))
         plain = simulate(
             s, spec(), make(size), 10, child, sg, adapt=False, detect=False, traces=10, single=True
@@ -527,16 +527,16 @@ def figures(out: Path, s: Scene, kept: dict, noise: dict, seed: int) -> None:
             fig, ax = new_figure(1, 1, size=(8, 3.5))
             claimed = np.sqrt(np.nanmean(plain.resid_var[:, w, 0], axis=0)) / FOOT_M
             sigma_band(ax, T_AXIS[w], plain.resid[:, w, 0] / FOOT_M, claimed, "residual, ft")
-            ax.set_title(f"Seed 001 fig. {b}: residual of the failed satellite in a single filter, {label}")
+            ax.set_title(f"Vanek 1999 fig. {b}: residual of the failed satellite in a single filter, {label}")
             save_figure(fig, out, f"fig{b:02d}_single_filter")
         columns = {"adaptive": o, "non-adaptive": plain}
-        error_figure(out, f"fig{c:02d}_errors", f"Seed 001 fig. {c}: {label}", s, columns)
+        error_figure(out, f"fig{c:02d}_errors", f"Vanek 1999 fig. {c}: {label}", s, columns)
         merit = {f"{x:g}": kept[table, x] for x, _ in cases}
-        merit_figure(out, f"fig{d:02d}_merit", f"Seed 001 fig. {d}: mean figure of merit", merit, cases)
+        merit_figure(out, f"fig{d:02d}_merit", f"Vanek 1999 fig. {d}: mean figure of merit", merit, cases)
 
 
 def run(out_dir: str | Path, quick: bool = False, seed: int = 1) -> list[dict]:
-    """Reproduce seed 001; writes figures and vanek.csv / vanek.json into ``out_dir`` and returns the rows."""
+    """Reproduce the thesis; writes figures and vanek.csv / vanek.json into ``out_dir`` and returns the rows."""
     out = Path(out_dir)
     s = scene("G*")
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(0,)))
