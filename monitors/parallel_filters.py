@@ -302,18 +302,6 @@ def monte_carlo(
                     trace_r[run, t, i] = var[i] - r0
 
 
-@njit(cache=True, nogil=True)
-def rmd_monte_carlo(v, v2, sigma, scheme, decay, divisor, window, out):
-    """R-hat (runs, T, m) of the redundant-measurement estimator alone; inputs as in ``monte_carlo``."""
-    runs, t_count, m = v.shape
-    ring = np.zeros(window)
-    for run in range(runs):
-        for i in range(m):
-            for t in range(t_count):
-                ring[t % window] = sigma[t, i] * (v[run, t, i] - v2[run, t, i])
-                out[run, t, i] = tuned_variance(ring, t + 1, scheme, decay, divisor, 0.0, 0, 2.0)
-
-
 class ParallelFilters(BaseModel):
     """Scenario section of the bank (Vanek 1999, table 1: period 18, three staggered, sum over 18, threshold 64).
 

@@ -21,8 +21,6 @@ FOOT_M = 0.3048
 EQUATORIAL_GRAVITY_MPS2 = 32.08744 * FOOT_M
 """g_o of Vanek 1999, appendix A (ft/s^2 converted)."""
 
-EARTH_RATE_ECEF = np.array([0.0, 0.0, EARTH_RATE_RAD_S])
-
 
 @njit(cache=True, nogil=True)
 def skew_into(v, out):

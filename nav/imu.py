@@ -242,7 +242,7 @@ def true_attitude(motion, t_s, kind="land", heading_rad=0.0):
     """C_be (m, 3, 3) and the specific force in ECEF (m, 3) of a motion at rising times t_s (m,)."""
     s = motion(np.asarray(t_s, float))
     pos = np.ascontiguousarray(s.pos_ecef_m)
-    force = specific_force_ecef(pos, s.vel_ecef_mps, s.acc_ecef_mps2, _gravity(pos))
+    force = specific_force_ecef(s.vel_ecef_mps, s.acc_ecef_mps2, _gravity(pos))
     return attitude(pos, s.vel_ecef_mps, force, kind, heading_rad), force
 
 

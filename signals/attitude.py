@@ -73,7 +73,7 @@ def attitude(
     return np.stack([forward, right, np.cross(forward, right)], axis=-1)
 
 
-def specific_force_ecef(pos_ecef_m, vel_ecef_mps, acc_ecef_mps2, gravity_ecef_mps2):
+def specific_force_ecef(vel_ecef_mps, acc_ecef_mps2, gravity_ecef_mps2):
     """f^e = a^e - g^e + 2 w_ie x v^e, (m, 3): what accelerometers feel (Abdel-Hafez, both papers, eq. 2)."""
     w = np.array([0.0, 0.0, EARTH_RATE_RAD_S])
     return acc_ecef_mps2 - gravity_ecef_mps2 + 2.0 * np.cross(w, vel_ecef_mps)

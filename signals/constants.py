@@ -28,5 +28,3 @@ MU_EARTH_M3_S2 = 3.986004418e14
 """WGS 84 gravitational constant of the Earth."""
 
 SECONDS_PER_WEEK = 604_800
-BOLTZMANN_DBW_HZ_K = -228.6
-"""Boltzmann's constant, 10 log10(1.380649e-23)."""

@@ -31,7 +31,7 @@ def _crc24q(bits):
     for i in range(bits.size):
         crc = (crc << 1) ^ (int(bits[i]) << 24)
         if crc & 0x1000000:
-            crc ^= 0x1864CFB
+            crc ^= CRC24Q
     return crc
 
 

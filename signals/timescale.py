@@ -6,8 +6,6 @@ from signals.constants import SECONDS_PER_WEEK
 
 GPS_EPOCH = datetime(1980, 1, 6)
 """Start of week 0 (IS-GPS-200, 3.3.4)."""
-GST_WEEK_OFFSET = 1024
-"""GST week 0 is GPS week 1024 (Galileo OS SIS ICD, 5.1.2)."""
 
 
 def week_tow(gps_time: datetime) -> tuple[int, int]:

@@ -44,7 +44,6 @@ __all__ = ["CHANNEL", "HISTORY", "SYMBOL", "survey", "track_slab"]
 
 HISTORY = 200
 """Prompts kept for the open-loop search: 200 ms of 1 ms (C/A), or 50 periods of 4 ms in halves (E1)."""
-BITS_PER_PERIODS = 20
 KIND_CA, KIND_PILOT, KIND_DATA = 0, 1, 2
 
 SYMBOL = np.dtype(
@@ -394,7 +393,7 @@ def _noise_power(st):
 
 
 @njit(nogil=True)
-def _close_loops(st, sample):
+def _close_loops(st):
     """Symbols are aligned: from here on the loops run at the settling bandwidths."""
     st.state = STATE_LOCKED
     st.settling, st.stage, st.stage_time_s, st.marks = 1, 0, 0.0, 0
@@ -492,7 +491,7 @@ def _synchronise(st, hist, secondary, noise, symbols, count):
         # 4 |S|^2 noise per sum. Four standard deviations between the first and the second decide.
         if top - second > 4.0 * math.sqrt(4.0 * top * noise):
             st.symbol_phase = edge
-            _close_loops(st, st.next_sample)
+            _close_loops(st)
         else:
             _retry(st, 20)
     elif st.kind == KIND_PILOT:
@@ -503,7 +502,7 @@ def _synchronise(st, hist, secondary, noise, symbols, count):
         count = _past_symbols(st, hist, secondary, f, rate, chip, symbols, count)
         _set_carrier(st, f, rate, cycles)
         st.symbol_phase = (chip - st.hist_period) % 25
-        _close_loops(st, st.next_sample)
+        _close_loops(st)
     else:
         f, magnitude = _search_data(hist)
         # Products of halves: variance of the mean of 50, each half with power 2 noise.
@@ -512,7 +511,7 @@ def _synchronise(st, hist, secondary, noise, symbols, count):
             return count
         _set_carrier(st, f, 0.0, 0.0)
         st.symbol_phase = 0
-        _close_loops(st, st.next_sample)
+        _close_loops(st)
     return count
 
 

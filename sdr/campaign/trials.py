@@ -86,7 +86,7 @@ def fit_thresholds(campaign: Campaign, group: int, values: list[list[np.ndarray]
         series = [trial[i] for trial in values]
         x = np.concatenate(series)
         try:
-            null, n = _fit_null(monitor, x, p_fa)
+            null, n = _fit_null(monitor, x)
             row["threshold"] = null.isf(p_fa)
             row["low"], row["high"] = null.interval(p_fa)
             row["roc"] = [_roc_threshold(null, x, n, p) for p in ROC_P_FA]
@@ -98,7 +98,7 @@ def fit_thresholds(campaign: Campaign, group: int, values: list[list[np.ndarray]
     return rows
 
 
-def _fit_null(monitor: MonitorSpec, x: np.ndarray, p_fa: float) -> tuple[Any, float]:
+def _fit_null(monitor: MonitorSpec, x: np.ndarray) -> tuple[Any, float]:
     """Null model by the monitor's rule; overlapping windows count once."""
     detector = monitor.detector
     n = float(len(x))
@@ -200,7 +200,7 @@ def _closed_trial(campaign: Campaign, runs: dict, point: int, trial: int, limits
     n_smooth = max(1, round(spec.trial.smooth_s / twin.integration_s))
     hatch_smooth(code_m, epochs["phase_error_cycles"] * WAVELENGTH_M, n_smooth, n_smooth, smoothed)
     rows = empty_trial(len(runs), point, trial)
-    rows["cn0_dbhz"], rows["lost"] = _carrier_health(epochs, twin.integration_s, spec.dumps)
+    rows["cn0_dbhz"], rows["lost"] = _carrier_health(epochs, twin.integration_s)
     for i, (row, name) in enumerate(zip(rows, runs)):
         s = runs[name].fresh()(summed)
         _count(row, s["value"], limits[i], s["epoch"], span(runs[name]), world, spec)
@@ -208,7 +208,7 @@ def _closed_trial(campaign: Campaign, runs: dict, point: int, trial: int, limits
     return rows
 
 
-def _carrier_health(epochs: np.ndarray, T: float, dumps: int) -> tuple[float, bool]:
+def _carrier_health(epochs: np.ndarray, T: float) -> tuple[float, bool]:
     """C/N0 = mean(|I|)^2 / (2 T var(|I|)) and whether the carrier was lost."""
     i = np.abs(epochs["prompt_i"])
     cn0 = 10 * math.log10(max(i.mean() ** 2 / (2 * T * max(i.var(), 1e-30)), 1e-3))

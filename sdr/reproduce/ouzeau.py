@@ -40,8 +40,6 @@ FFT_I = {"name": "fft-i", "rule": "gaussian", "detector": {"kind": "FFT", "input
 FFT_IQ = {"name": "fft-iq", "rule": "gaussian", "detector": {"kind": "FFT"}}
 FFT_TAIL = {"name": "fft-iq-tail", "rule": "pareto", "detector": {"kind": "FFT"}}
 GLRT = {"name": "glrt", "rule": "analytic", "detector": {"kind": "GLRT"}}
-CALIBRATION = 0.375
-"""|df| T for which a count over 400 passes met the published P_MD: a calibration made after the fact, never a result."""
 NORMAL, ABNORMAL = (0.58, 0.5, 0.25), (2.00, 1.5, 0.74)
 """Horizontal and vertical acceleration (g) and jerk (g/s) of table 4."""
 G = 9.81
