@@ -235,12 +235,13 @@ class BiasTracker:
         return self.names[int(report.row[best])], value, float(report.bias_m[best])
 
     def faulty(self, report: BiasReport, before: str | None) -> str | None:
-        """The satellite that is biased by whatever size, as probable as ``declare`` wants; ``before`` stays while it is likelier than not."""
+        """The satellite that is biased by whatever size, as probable as ``declare`` wants; ``before`` stays while some bias is likelier
+        than none, whoever has it."""
         of = np.bincount(report.row, np.where(report.bias_m != 0, report.probability, 0.0), len(self.names))
         top = int(np.argmax(of))
         if of[top] >= self.spec.declare and report.fits:
             return self.names[top]
-        return before if before in self.names and of[self.names.index(before)] > 0.5 else None
+        return before if of.sum() > 0.5 else None
 
     def correction(self, report: BiasReport) -> dict[str, float]:
         """Declared biases by name."""
