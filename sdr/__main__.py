@@ -341,15 +341,16 @@ def reproduce(
 
 @app.command
 def scenarios(*, json: Json = False) -> None:
-    """List the built-in scenarios."""
-    from sdr import scenario, toml
+    """List the built-in scenarios and campaigns."""
+    from sdr import toml
 
-    table = [{"name": n, "description": scenario.load(n)[0].description} for n in toml.built_in("scenario")]
-    _report(
-        "scenarios",
-        {"scenarios": table, "text": "\n".join(f"{r['name']:24} {r['description']}" for r in table)},
-        json,
-    )
+    result: dict[str, Any] = {}
+    for kind in ("scenario", "campaign"):
+        tables = {n: toml.table(toml.read(n, kind), n) for n in toml.built_in(kind)}
+        result[f"{kind}s"] = [{"name": n, "description": t.get("description", "")} for n, t in tables.items()]
+    lines = [f"{r['name']:24} {r['description']}" for r in result["scenarios"]]
+    lines += ["", "campaigns:"] + [f"{r['name']:24} {r['description']}" for r in result["campaigns"]]
+    _report("scenarios", result | {"text": "\n".join(lines)}, json)
 
 
 def _report(command: str, result: dict[str, Any], as_json: bool) -> None:

@@ -1,11 +1,13 @@
 """Every built-in scenario loads, starts and delivers samples; the schema refuses what it does not know."""
 
+import json
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 
+from sdr import __main__ as command_line
 from sdr import jobs, scenario, toml
 
 
@@ -64,3 +66,11 @@ def test_figures_show_what_a_scenario_has(tmp_path, name, more, figures):
             before, after = (h5[f"{part}/spectrum"][15:].mean(axis=0) for part in ("samples", "mitigation"))
             assert before.max() - np.median(before) > 30.0
             assert after.max() - np.median(after) < 6.0
+
+
+def test_scenarios_and_campaigns_are_listed(capsys):
+    command_line.scenarios(json=True)
+    told = json.loads(capsys.readouterr().out)
+    for kind in ("scenario", "campaign"):
+        assert [r["name"] for r in told[f"{kind}s"]] == toml.built_in(kind)
+        assert all(r["description"] for r in told[f"{kind}s"])
