@@ -16,6 +16,7 @@ hardly tells two satellites apart, both are corrected, each by what it may be, a
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from nav.eskf import EpochLog
 
@@ -43,7 +44,7 @@ class Posterior(NamedTuple):
 class SeparateBias:
     """Offsets of one of ``rows`` of a filter of ``n`` states that begin at any epoch fed with ``onset=True``; a priori sigma ``tau_m``."""
 
-    def __init__(self, rows: np.ndarray, n: int, tau_m: float) -> None:
+    def __init__(self, rows: ArrayLike, n: int, tau_m: float) -> None:
         self.rows, self.tau_m = np.asarray(rows), tau_m
         self._c, self._row = np.zeros((n, 0)), np.zeros(0, np.int64)
         self._since_s, self._drifts = np.zeros(0), np.zeros(0, bool)
@@ -91,7 +92,7 @@ class SeparateBias:
         self._keep(w > NEGLIGIBLE * w.max())
         return out
 
-    def without(self, rows: np.ndarray) -> None:
+    def without(self, rows: ArrayLike) -> None:
         """Another satellite has these rows now."""
         self._keep(~np.isin(self._row, rows))
 
