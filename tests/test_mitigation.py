@@ -79,22 +79,53 @@ def test_excision_follows_the_front_end_filter():
     assert np.mean(np.abs(left) ** 2) < 0.1 * np.mean(iq.astype(float) ** 2)
 
 
-def test_tone_estimates_reach_the_bound():
-    """Frequency variance 1.0147 x 6 / ((2 pi)^2 rho n (n^2 - 1)), amplitude sigma^2 / (2 n): 400 trials, z sqrt(2 / n)."""
-    rng, n, rho, trials = np.random.default_rng(2), 2000, 0.1, 400
-    a = math.sqrt(2 * rho)
+@pytest.mark.parametrize("sweep", [0.0, 30.0])
+def test_tone_estimates_reach_the_bound(sweep):
+    """Variances of the middle frequency 6 / ((2 pi)^2 rho n^3), of the rate 90 / (pi^2 rho n^5), of the amplitude
+    sigma^2 / (2 n), at rest and swept by 30 bins: 400 trials, z sqrt(2 / n)."""
+    rng, n, rho, trials = np.random.default_rng(2), 2000, 0.3, 400
+    a, k = math.sqrt(2 * rho), np.arange(n) - 0.5 * (n - 1)
     errors = []
     for _ in range(trials):
-        f, phase = rng.uniform(-0.45, 0.45), rng.uniform(0, 1)
-        z = a * np.exp(2j * np.pi * (f * np.arange(n) + phase))
+        f, phase, rate = rng.uniform(-0.45, 0.45), rng.uniform(0, 1), rng.uniform(-1, 1) * sweep / n**2
+        z = a * np.exp(2j * np.pi * (f * k + 0.5 * rate * k * k + phase))
         z += rng.standard_normal(n) + 1j * rng.standard_normal(n)
-        found, gain, energy = estimate_tone(z, math.log(n / 1e-4))
-        errors.append((found - f, abs(gain) - a, 10 * math.log10(energy / (rho * n))))
+        found, swept, gain, energy = estimate_tone(z, math.log(n / 1e-4))
+        errors.append((found - f, swept - rate, abs(gain) - a, 10 * math.log10(energy / (rho * n))))
     variance = np.var(np.array(errors), axis=0)
-    bound = 1.0147 * 6 / (4 * np.pi**2 * rho * n * (n**2 - 1))
-    assert variance[0] / bound == pytest.approx(1.0, abs=Z * math.sqrt(2 / trials))
-    assert variance[1] * n == pytest.approx(1.0, abs=Z * math.sqrt(2 / trials))
+    bounds = 6 / (4 * np.pi**2 * rho * n**3), 90 / (np.pi**2 * rho * n**5), 1 / n
+    np.testing.assert_allclose(variance[:3] / bounds, 1.0, atol=Z * math.sqrt(2 / trials))
+    assert abs(np.mean(errors, axis=0)[3]) < Z * math.sqrt(variance[3] / trials) + 0.1
     assert estimate_tone(rng.standard_normal(n) + 1j * rng.standard_normal(n), math.log(n / 1e-4)) is None
+
+
+@pytest.mark.parametrize("jn_db", [0.0, 40.0])
+@pytest.mark.parametrize("rate_hz_s", [1e3, 1e5, 1e8])
+def test_a_swept_tone_is_removed(rate_hz_s, jn_db):
+    """Of a tone of which phase, amplitude, frequency and rate are estimated, 4 dimensions of 2 n stay: half a noise
+    sample of 2 each. So little is left of 40 dB, as frames of 10 ms hold up to a quarter of the band."""
+    n = 160_000
+    t = np.arange(n) / FS_HZ
+    a = math.sqrt(800 * 10 ** (jn_db / 10))
+    tone = a * np.exp(2j * np.pi * (0.5 * rate_hz_s * t - 1.9e6) * t)
+    clean = noise(n).astype(np.float64)
+    run = Cancellation(max_tones=1).start(
+        Samples((np.stack([tone.real, tone.imag]) + clean).astype(np.float32))
+    )
+    _, y = run.read(n)
+    rows = run.tones()
+    assert len(rows) == 4
+    middle_hz = -1.9e6 + rate_hz_s * (rows["sample_index"] + 20_000 - 0.5) / FS_HZ
+    rho, m = a**2 / 800, 40_000.0
+    np.testing.assert_allclose(
+        rows["freq_hz"], middle_hz, atol=Z * FS_HZ * math.sqrt(6 / (4 * np.pi**2 * rho * m**3))
+    )
+    np.testing.assert_allclose(
+        rows["rate_hz_s"], rate_hz_s, atol=Z * FS_HZ**2 * math.sqrt(90 / (np.pi**2 * rho * m**5))
+    )
+    left = np.sum((y - clean) ** 2)
+    # chi square of 4 x 4 degrees, variance 400 each
+    assert left / 400 < 16 + Z * math.sqrt(32) + 2
 
 
 def cn0_dbhz(jammer, spec, duration_s=0.4, **front_end):
@@ -167,7 +198,7 @@ def test_cancellation_reports_what_it_removed():
     rows = run.tones()
     assert len(rows) == 10
     # CRB over 40,000 samples at rho = 900 / 800
-    sigma = math.sqrt(1.0147 * 6 / (4 * np.pi**2 * a**2 / 800 * 40_000.0**3)) * FS_HZ
+    sigma = math.sqrt(6 / (4 * np.pi**2 * a**2 / 800 * 40_000.0**3)) * FS_HZ
     np.testing.assert_allclose(rows["freq_hz"], f, atol=Z * sigma)
     np.testing.assert_allclose(rows["amplitude"], a, atol=Z * 20 / math.sqrt(40_000))
 

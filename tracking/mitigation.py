@@ -25,12 +25,15 @@ __all__ = [
 
 _FROZEN = ConfigDict(frozen=True, extra="forbid")
 _CHUNK = 1 << 16
+_PARTS = 64
+"""Parts of a frame whose phases are fitted: a bin beside the tone costs each 4e-4 of its power."""
 
 TONE = np.dtype(
     [
         ("sample_index", "u8"),  # first sample of the frame that it was estimated in
         ("n_samples", "i4"),
-        ("freq_hz", "f8"),  # offset from the carrier
+        ("freq_hz", "f8"),  # offset from the carrier, in the middle of the frame
+        ("rate_hz_s", "f8"),  # of the frequency
         ("amplitude", "f8"),  # in ADC levels
         ("phase_cycles", "f8"),  # at sample_index, in [0, 1)
         ("energy_db", "f8"),  # energy in the frame over the noise density
@@ -139,7 +142,7 @@ class Notch(BaseModel):
             if abs(z0) <= self.engage:
                 return y, []
             freq_hz = np.angle(z0) / (2 * math.pi) * source.fs_hz - source.if_hz
-            return y, [(n0, x.shape[1], freq_hz, np.nan, np.nan, np.nan)]
+            return y, [(n0, x.shape[1], freq_hz, np.nan, np.nan, np.nan, np.nan)]
 
         return Mitigated(source, length, frame)
 
@@ -165,9 +168,11 @@ def notch(iq, state, contraction, step, engage):
 
 
 class Cancellation(BaseModel):
-    """Tones are characterised frame by frame, frequency, amplitude and phase, and subtracted.
+    """Tones are characterised frame by frame, frequency and its rate, amplitude and phase, and subtracted.
 
-    ``p_fa``: that a frame of noise alone has a tone, over all its bins.
+    Sweeps of up to fs / frame are followed (4e8 Hz/s at 4 Msps and 10 ms) while the rate holds within the frame and the
+    tone is not lost in the noise (`estimate_tone`); a chirp's turns need frames shorter than its sweep. ``p_fa``: that a
+    frame of noise alone has a tone, over all its bins.
     """
 
     model_config = _FROZEN
@@ -181,7 +186,7 @@ class Cancellation(BaseModel):
 
     def start(self, source: Any) -> "Mitigated":
         """Source of the mitigated samples."""
-        length = max(round(self.frame_ms * 1e-3 * source.fs_hz), 16)
+        length = max(round(self.frame_ms * 1e-3 * source.fs_hz), _PARTS)
 
         def frame(n0: int, x: np.ndarray) -> tuple[np.ndarray, list]:
             z = x[0] + 1j * x[1].astype(np.float64)
@@ -190,41 +195,75 @@ class Cancellation(BaseModel):
                 found = estimate_tone(z, math.log(len(z) / self.p_fa))
                 if found is None:
                     break
-                turns, gain, energy = found
-                z = z - gain * np.exp(2j * np.pi * turns * np.arange(len(z)))
-                freq_hz = turns * source.fs_hz - source.if_hz
-                phase = np.angle(gain) / (2 * math.pi) % 1.0
-                rows.append((n0, len(z), freq_hz, abs(gain), phase, 10 * math.log10(energy)))
+                turns, rate, gain, energy = found
+                tone = gain * _sweep(len(z), turns, rate)
+                z = z - tone
+                freq_hz, phase = turns * source.fs_hz - source.if_hz, np.angle(tone[0]) / (2 * math.pi) % 1.0
+                rate_hz_s = rate * source.fs_hz**2
+                rows.append((n0, len(z), freq_hz, rate_hz_s, abs(gain), phase, 10 * math.log10(energy)))
             return np.stack([z.real, z.imag]).astype(np.float32), rows
 
         return Mitigated(source, length, frame)
 
 
-def estimate_tone(z: np.ndarray, threshold: float) -> tuple[float, complex, float] | None:
-    """The strongest tone in complex samples (n,): frequency in cycles per sample, complex amplitude at the first one,
-    and energy over noise density; None below ``threshold``.
+def estimate_tone(z: np.ndarray, threshold: float) -> tuple[float, float, complex, float] | None:
+    """The strongest tone in complex samples (n,): frequency (cycles per sample) and complex amplitude in their middle,
+    its rate (cycles per sample^2), and energy over noise density; None below ``threshold``
+    or under _PARTS samples.
 
-    The largest bin of the FFT, then two steps of Aboutanios and Mulgrew (IEEE Trans. SP 53(4), 2005, eq. 6): with
-    the transform X at half a bin beside the estimate, d = Re[(X+ + X-) / (X+ - X-)] / 2. Its variance is 1.0147
-    times the Cramer-Rao bound 6 / ((2 pi)^2 rho n (n^2 - 1)), rho = A^2 / (noise power). Noise: median / ln 2 of the bins.
+    The largest bin of the FFT, of z as it is or with the sweep taken out that shows as the largest bin of z[k + n/2]
+    conj(z[k]) (Peleg and Porat, IEEE Trans. AES 27(4), 1991), which needs n/2 rho^2 / (1 + 2 rho) > ``threshold``, rho = A^2 /
+    (noise power). Then Gauss-Newton on the phases of the first two Legendre moments to the least squares, whose
+    variances are the Cramer-Rao bounds 6 / ((2 pi)^2 rho n^3) and 90 / (pi^2 rho n^5). Noise: median / ln 2 of the bins.
     """
+    n, lag = len(z), len(z) // 2
+    if n < _PARTS:
+        return None
+    rates = [0.0]
+    energy, turns, _ = _peak(z[lag:] * np.conj(z[: n - lag]), 2)
+    if energy > threshold:
+        rates.append(turns / lag)
+    tones = []
+    for rate in rates:
+        energy, turns, density = _peak(z * np.conj(_sweep(n, 0.0, rate)) if rate else z)
+        if energy > threshold:
+            tones.append((_least_squares(z, turns, rate), density))
+    if not tones:
+        return None
+    (turns, rate, gain), density = max(tones, key=lambda tone: abs(tone[0][2]))
+    return (turns + 0.5) % 1.0 - 0.5, rate, gain, abs(gain) ** 2 * n / density
+
+
+def _least_squares(z: np.ndarray, turns: float, rate: float) -> tuple[float, float, complex]:
+    """Frequency and rate near the given ones whose tone leaves least of z, and its complex amplitude."""
+    n = len(z)
+    first = np.arange(_PARTS) * n // _PARTS
+    parts = np.add.reduceat(z * np.conj(_sweep(n, turns, rate)), first)
+    u = 0.5 * (first + np.append(first[1:], n)) / n - 0.5
+    for _ in range(6):
+        moments = np.array([np.sum(parts), u @ parts, (u * u - 1 / 12) @ parts])
+        slope, bend = np.imag(moments[1:] / moments[0]) * (12.0, 180.0)
+        parts = parts * np.exp(-1j * (slope + bend * u) * u)
+        turns += slope / (2 * math.pi * n)
+        rate += bend / (math.pi * n * n)
+    return turns, rate, complex(np.vdot(_sweep(n, turns, rate), z) / n)
+
+
+def _sweep(n: int, turns: float, rate: float) -> np.ndarray:
+    """exp(2 pi i (turns k + rate k^2 / 2)), k from the middle of n samples."""
+    k = np.arange(n) - 0.5 * (n - 1)
+    return np.exp(2j * np.pi * (turns + 0.5 * rate * k) * k)
+
+
+def _peak(z: np.ndarray, bins: int = 1) -> tuple[float, float, float]:
+    """Largest of ``bins`` len(z) bins of the FFT: energy over noise density, frequency in cycles per sample; that density."""
     from scipy.fft import fft
 
-    n = len(z)
-    spectrum = fft(z)
+    spectrum = fft(z, bins * len(z))
     power = spectrum.real**2 + spectrum.imag**2
-    noise = np.median(power) / math.log(2)
-    peak = int(np.argmax(power))
-    if not power[peak] > threshold * noise:
-        return None
-    k, turns = np.arange(n), peak / n
-    for _ in range(2):
-        base = z * np.exp(-2j * np.pi * turns * k)
-        half = np.exp(1j * np.pi * k / n)
-        below, above = np.dot(base, half), np.dot(base, np.conj(half))
-        turns += 0.5 * float(((above + below) / (above - below)).real) / n
-    gain = complex(np.dot(z, np.exp(-2j * np.pi * turns * k)) / n)
-    return (turns + 0.5) % 1.0 - 0.5, gain, abs(gain) ** 2 * n * n / noise
+    density = max(float(np.median(power)) / math.log(2) / len(z), 1e-300)
+    k = int(np.argmax(power))
+    return float(power[k]) / (density * len(z)), k / len(power) - (2 * k >= len(power)), density
 
 
 class Mitigated:
