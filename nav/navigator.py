@@ -5,6 +5,7 @@ nothing else: no truth and no start time enters. When there is no position, ``re
 why.
 """
 
+from collections.abc import Set
 from copy import copy
 from typing import Annotated, Literal, NamedTuple
 
@@ -143,7 +144,7 @@ def _name(system, prn):
 class Navigator:
     """Run of a NavigationSpec.
 
-    After ``update``: ``reason`` (empty on success), ``observations`` and ``satellites`` (aligned rows of the
+    After ``update``: ``reason`` (empty on success), ``late`` (the ranges said that samples are missing), ``observations`` and ``satellites`` (aligned rows of the
     epoch), ``used`` (names), ``excluded`` (names RAIM left out), ``residual_m`` (n,) and ``notes`` (what
     was asked for and could not be applied yet).
     """
@@ -164,6 +165,8 @@ class Navigator:
         self.snapshot: Snapshot | None = None
         self.log: NavigatorLog | None = None
         """Set one to have the filter's epochs recorded; recording changes nothing."""
+        self.late = False
+        self._doubted: Set[tuple[bytes, int]] = frozenset()
         self._remedy: Remedy | None = None
         self._extra: np.ndarray | None = None
         self._smoothing = np.ones(0)
@@ -179,8 +182,9 @@ class Navigator:
         self._rejected_epochs = 0
 
     def update(
-        self, transmit, ephemeris, iono_utc_gps=None, iono_utc_galileo=None, remedy: Remedy | None = None
-    ):
+        self, transmit, ephemeris, iono_utc_gps=None, iono_utc_galileo=None, remedy: Remedy | None = None,
+        doubted=frozenset(),
+    ):  # fmt: skip
         """One epoch.
 
         Parameters
@@ -191,13 +195,16 @@ class Navigator:
             Klobuchar parameters (GPS) and the GGTO (Galileo), as far as decoded.
         remedy : Remedy or None
             What the integrity monitors ask for; None changes nothing.
+        doubted : set of (system, prn), b"G" or b"E"
+            Satellites whose transmit times no message has confirmed since all channels were disturbed.
 
         Returns
         -------
         SOLUTION row, or None with ``reason`` set.
         """
         self.reason, self.notes, self.used, self.excluded = "", [], [], []
-        self.snapshot = None
+        self.snapshot, self.late = None, False
+        self._doubted = doubted
         self._take(remedy)
         try:
             obs, eph = self._select(transmit, np.atleast_1d(ephemeris))
@@ -206,7 +213,7 @@ class Navigator:
             fix = self._filter if self._filter_sample >= 0 else self._least_squares
             return fix(obs, sats, eph, iono_utc_gps, iono_utc_galileo)
         except NoFix as why:
-            self.reason = str(why)
+            self.reason, self.late = str(why), isinstance(why, pvt.Late)
             return self._coast(transmit, ephemeris)
 
     def _take(self, remedy):
@@ -371,6 +378,22 @@ class Navigator:
     def _above_mask(self, sats):
         return (sats["elevation_rad"] >= np.radians(self.spec.elevation_mask_deg)).astype(np.uint8)
 
+    @property
+    def _p_fa(self):
+        return self.spec.raim_p_fa if self.spec.raim else 0.0
+
+    def _check_time(self, obs, sats, second, offset, use, estimate, state):
+        """Raise NoFix where samples are missing; unsmoothed ranges, for smoothing remembers those before a hole."""
+        at = use == 1
+        doubted = any((s, int(p)) in self._doubted for s, p in zip(sats["system"][at], sats["prn"][at]))
+        expected, unused, los = np.empty(obs.size), np.empty(obs.size), np.zeros((obs.size, 3))
+        pos, vel = (np.ascontiguousarray(sats[f]) for f in ("pos_ecef_m", "vel_ecef_mps"))
+        kernels.predict_ranges(pos, vel, state[:3], self._vel, expected, unused, los)
+        variance = self._variance(obs, sats) / self._smoothing
+        residual = self._corrected(obs, sats, offset, "pseudorange_m") - expected
+        m = pvt.count_unknowns(second, use, estimate)
+        pvt.refuse_late(sats, los, variance, second, use, residual, m, self._p_fa, doubted)
+
     # -- least squares --
 
     def _least_squares(self, obs, sats, eph, iono_utc_gps, iono_utc_galileo):
@@ -378,18 +401,20 @@ class Navigator:
         tow_s = obs["tow_tx_s"][0]
         klobuchar = self._klobuchar(iono_utc_gps)
         everyone = np.ones(obs.size, np.uint8)
-        p_fa = self.spec.raim_p_fa if self.spec.raim else 0.0
+        p_fa = self._p_fa
         if self._state is None:
             crude = self._corrected(obs, sats, offset, "pseudorange_m")
             variance = np.full(obs.size, FIRST_SIGMA_M**2)
             start = pvt.raim(sats, crude, variance, second, everyone, estimate, p_fa)[0].state
         else:
             start = self._state
-        for _ in range(3):  # elevations and delays come from the position of the pass before
+        for turn in range(3):  # elevations and delays come from the position of the pass before
             pvt.look(sats, start[:3], self._vel, tow_s, klobuchar, self.spec.tropo != "none")
             use = self._above_mask(sats)
             self._say_masked(use)
             use[self._excluded(sats)] = 0
+            if turn == 0:
+                self._check_time(obs, sats, second, offset, use, estimate, start)
             corrected = self._corrected(obs, sats, offset, "pseudorange_smoothed_m")
             variance = self._variance(obs, sats)
             fix, out = pvt.raim(sats, corrected, variance, second, use, estimate, p_fa, start)
@@ -531,6 +556,8 @@ class Navigator:
         tropo = self.spec.tropo != "none"
         pvt.look(sats, self._x[:3], self._x[3:6], obs["tow_tx_s"][0], klobuchar, tropo)
         use = self._above_mask(sats) == 1
+        present = np.where(self._excluded(sats), 0, use).astype(np.uint8)
+        self._check_time(obs, sats, second, offset, present, estimate, self._x)
         n = int(use.sum())
         ranges = self._corrected(obs, sats, offset, "pseudorange_m")[use]
         range_var = self._variance(obs, sats)[use]

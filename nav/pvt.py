@@ -25,10 +25,16 @@ from signals.orbits import orbit_coefficients
 
 MAX_ITERATIONS = 25
 HUMIDITY = 0.7
+LATE_S = 1e-3
+"""Errors of all transmit times below this, which cost less than a metre, are not looked for."""
 
 
 class NoFix(Exception):
     """No position at this epoch; the text is one sentence for the user."""
+
+
+class Late(NoFix):
+    """All transmit times are off together."""
 
 
 class Position(NamedTuple):
@@ -247,6 +253,56 @@ def chi2_threshold(dof, p_fa):
     from scipy.special import chdtri
 
     return float(chdtri(dof, p_fa)) if dof >= 1 else math.inf
+
+
+def time_error(sats, los, variance, second, use, residual_m, m):
+    """One error of all transmit times, which the ranges tell as a fifth (sixth) unknown.
+
+    Where all transmit times are tau too early and the receiver time with them, as after a hole in the samples,
+    ranges are measured as they are but expected tau earlier: residual_i = (u_i . v_i) tau (the unknown of coarse-time
+    navigation: van Diggelen, A-GPS, 2009, section 4.3).
+
+    Returns
+    -------
+    (tau_s, sigma_s, chi2 without this unknown, chi2 with it, chi2 with the one satellite left out that lowers it most).
+    """
+    part, root = use == 1, 1.0 / np.sqrt(variance[use == 1])
+    columns = np.column_stack([los[part], np.ones(part.sum()), second[part]])[:, :m] * root[:, None]
+    basis, _ = np.linalg.qr(columns)
+    slide = np.einsum("ij,ij->i", los[part], sats["vel_ecef_mps"][part]) * root
+    y = residual_m[part] * root
+    slide, y = slide - basis @ (basis.T @ slide), y - basis @ (basis.T @ y)
+    power, chi2 = float(slide @ slide), float(y @ y)
+    tau_s = float(slide @ y) / power
+    free = 1.0 - np.sum(basis**2, axis=1)
+    without = chi2 - float(np.max(np.where(free > 1e-9, y**2 / np.maximum(free, 1e-9), 0.0)))
+    return tau_s, 1.0 / math.sqrt(power), chi2, chi2 - tau_s**2 * power, without
+
+
+def refuse_late(sats, los, variance, second, use, residual_m, m, p_fa, doubted):
+    """Raise Late where one error of all transmit times explains the ranges: samples are missing.
+
+    Without doubt of the time, the ranges must fail their test (chi-square, ``p_fa``), pass it with this unknown, and gain
+    more by it than by any satellite left out; in doubt (a disturbance of all channels, and no message since) it is
+    enough that the unknown itself is significant, and without redundancy there is no fix.
+    """
+    dof = int(use.sum()) - m
+    if dof < 2:
+        if doubted and p_fa > 0.0:
+            raise NoFix(
+                "all channels were disturbed at once, as by missing samples, and no message has confirmed the time "
+                f"since; {int(use.sum())} satellites are too few to test it."
+            )
+        return
+    tau_s, sigma_s, chi2, rest, without = time_error(sats, los, variance, second, use, residual_m, m)
+    if abs(tau_s) < LATE_S or rest > chi2_threshold(dof - 1, p_fa):
+        return
+    fails = chi2 > chi2_threshold(dof, p_fa) and rest < without
+    if fails or (doubted and chi2 - rest > chi2_threshold(1, p_fa)):
+        raise Late(
+            f"the ranges fit together only if time is off by {tau_s * 1e3:.0f} ± {sigma_s * 1e3:.0f} ms: samples are "
+            "missing, and the position waits for the time in the messages."
+        )
 
 
 def raim(sats, corrected_m, variance, second, use, estimate_isb, p_fa, start=None):

@@ -253,6 +253,7 @@ def results_lines() -> Iterator[str]:
     import sdr.campaign.results
     import sdr.campaign.spec
     import sdr.findings
+    import sdr.holes
     import sdr.modes
     import sdr.respond
     import sdr.watch.post
@@ -268,6 +269,7 @@ def results_lines() -> Iterator[str]:
         ("navigation/solution", n, "SOLUTION"),
         ("navigation/satellites", n, "VIEW"),
         ("navigation/steering", n, "STEERING"),
+        ("navigation/holes", sdr.holes, "HOLE"),
         ("truth/satellites", s, "TRUTH"),
         ("truth/receiver", s, "PVT_TRUTH"),
         ("truth/jammers", s, "JAMMER_TRUTH"),

@@ -446,6 +446,7 @@ class Decoder:
     almanac : SVID -> dict of almanac elements.
     health, healthy : E1B_DVS + 2 E1B_HS; healthy is None before word 5.
     svid : of the last word 4.
+    timed_index : index of the last page that said the time; -1 before any.
     pages_ok, pages_failed, pages_alert : counts while synced (alert pages cannot be checked on E1-B alone).
     words : number of good pages by word type.
     """
@@ -474,6 +475,7 @@ class Decoder:
         self._missed = 0
         self._phase: int | None = None  # confirmed: symbols since the start of the week at index 0
         self._phase_candidate: int | None = None
+        self.timed_index = -1
         self._week_anchor: tuple[int, int, int] | None = None  # (week, index of a symbol in it, phase)
         self._set: dict[int, dict[str, float]] = {}
         self._word_5: dict[str, float] | None = None
@@ -617,7 +619,7 @@ class Decoder:
             if missing and self._week_anchor is not None:
                 week, anchor, _ = self._week_anchor
                 self._week_anchor = week, anchor - missing, phase
-        self._phase_candidate = phase
+        self._phase_candidate, self.timed_index = phase, index
         if "gst_week" in values:
             self._week_anchor = (int(values["gst_week"]) + GST_WEEK_0, index, phase)
 

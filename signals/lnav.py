@@ -152,8 +152,10 @@ def _odd(x):
 
 @njit(cache=True, nogil=True)
 def _parity(x):
-    p = _odd(x & 0x2EC7CD2) << 5 | _odd(x & 0x1763E69) << 4 | _odd(x & 0x2BB1F34) << 3
-    return p | _odd(x & 0x15D8F9A) << 2 | _odd(x & 0x1AEC7CD) << 1 | _odd(x & 0x22DEA27)
+    bits = 0
+    for mask in PARITY_MASKS:
+        bits = bits << 1 | _odd(x & mask)
+    return bits
 
 
 def parity(data: int, previous: int) -> int:
@@ -168,8 +170,8 @@ def _transmit(words, previous, bits):
         if w % 10 == 1 or w % 10 == 9:
             # bits 23, 24 are chosen so that D29 = D30 = 0; d24 alone enters D29, d23 only D30
             data &= 0xFFFFFC
-            data |= _odd(((previous << 24) | data) & 0x1AEC7CD)
-            data |= _odd(((previous << 24) | data) & 0x22DEA27) << 1
+            data |= _odd(((previous << 24) | data) & PARITY_MASKS[4])
+            data |= _odd(((previous << 24) | data) & PARITY_MASKS[5]) << 1
         check = _parity((previous << 24) | data)
         sent = (((data ^ 0xFFFFFF) if previous & 1 else data) << 6) | check
         for i in range(30):
@@ -423,6 +425,7 @@ class Decoder:
     iono_utc, iono_utc_valid : IONO_UTC record and the set of its parts received ("klobuchar", "utc").
     almanac : prn -> dict of almanac elements.
     health, alert, healthy : 6-bit health, alert flag of the last header, and their summary (None = unknown).
+    timed_index : index of the last header that said the time; -1 before any.
     words_ok, words_failed, subframes_ok, subframes_failed : parity counts while synced.
     ggto : None (LNAV carries none).
     """
@@ -452,7 +455,7 @@ class Decoder:
         self._missed = 0
         self._phase: int | None = None  # confirmed: symbols since the start of the week at index 0
         self._phase_candidate: int | None = None
-        self._candidate_index = -1  # of the header it came from
+        self.timed_index = -1
         self._week_anchor: tuple[int, int, int] | None = None  # (week, index of a symbol in it, phase)
         self._subframes: dict[int, dict[str, float]] = {}
         self._said: dict[int, dict[str, float]] = {}  # orbit or clock of the last subframe of each kind
@@ -590,9 +593,9 @@ class Decoder:
         if header["subframe"] != count % 5 + 1:
             return False
         phase = (count * SUBFRAME_BITS - index) % self.symbols_per_week
-        if index != self._candidate_index:
+        if index != self.timed_index:
             self._confirm(phase)
-        self._phase_candidate, self._candidate_index = phase, index
+        self._phase_candidate, self.timed_index = phase, index
         self.alert = bool(header["alert"])
         return True
 

@@ -35,6 +35,7 @@ class Telemetry:
         self._heard = []  # (symbols, counts) of the slabs that wait to be decoded
         self._slips = {}  # satellite -> (slips, transmit time of symbol 0) at the last call of slipped
         self._tail = {}  # Galileo satellite -> last nine symbol signs, while its pages are not synchronised
+        self._asked = {}  # satellite -> symbol index from which on a message must say the time again
         self._matches = {}  # Galileo satellite -> [upright, inverted] sync patterns seen meanwhile
 
     def start(self, c):
@@ -140,6 +141,16 @@ class Telemetry:
             self._slips[key] = now
         return out
 
+    def doubt(self):
+        """Samples may be missing up to here: no transmit time is sure until a message says it again."""
+        self._asked = dict(self._end)
+
+    def doubted(self):
+        """Satellites whose messages have not said the time since ``doubt`` -> frozenset of (b"G" or b"E", prn)."""
+        for key in [k for k, asked in self._asked.items() if self.decoders[k].timed_index >= asked]:
+            del self._asked[key]
+        return frozenset((system.encode(), prn) for system, prn in self._asked)
+
     def ephemerides(self):
         """Newest decoded ephemeris of each satellite -> EPHEMERIS (n,)."""
         rows = [d.ephemeris for d in self.decoders.values() if d.ephemeris is not None]
@@ -160,6 +171,7 @@ class Telemetry:
     def forget(self, system, prn):
         """What the channels of this satellite said was not its own."""
         self.decoders.pop((system, prn), None)
+        self._asked.pop((system, prn), None)
         for c in [c for c in self._base if self._satellite(c) == (system, prn)]:
             del self._base[c]
             for _, counts in self._heard:
