@@ -35,6 +35,8 @@ from sdr.respond import RespondSpec, rows_of
 from sdr.watched import NavigatorWatch, SteeringWatch, Watched
 
 MONITORS = ("innovation", "raim", "bias_bank", "als", "noise_rmd", "parallel_filters")
+LEVELS = "protection"
+"""It raises no alarm, but says why there is no level."""
 _FROZEN = ConfigDict(frozen=True, extra="forbid")
 
 
@@ -84,7 +86,7 @@ class IntegrityLive:
 
     def __init__(self, spec: IntegritySpec, respond: RespondSpec, fs_hz: float) -> None:
         self.spec, self.fs_hz = spec, fs_hz
-        self.alarms = {n: Alarms(spec.gap_s) for n in MONITORS if getattr(spec, n) is not None}
+        self.alarms = {n: Alarms(spec.gap_s) for n in (*MONITORS, LEVELS) if getattr(spec, n) is not None}
         self.remedy: Remedy | None = None
         self.response = respond.start()
         self.steered: SteeringWatch | None = None
@@ -139,9 +141,9 @@ class IntegrityLive:
         dx, p = filter_monitors(watch, sample, t_s, out)
         self._name_rivals(out.get("parallel_filters"))
         self._noise_rows(watch, snap, sample, t_s, out)
-        for name, rows in out.items():
-            if name in self.alarms:
-                self.alarms[name].add(rows)
+        for name in MONITORS:
+            if name in out:
+                self.alarms[name].add(out[name])
         removal = self._ranges.remove(watch.log, dx is not None)
         if removal.dx is not None:
             filter_monitors.moved(removal.dx)
@@ -188,11 +190,12 @@ class IntegrityLive:
             self.response.scale = {n: v / o for n, v, o in zip(names, var, own) if v > 0}
 
     def report(self) -> list[dict[str, Any]]:
-        """One row per monitor and satellite that it tested, for JSON."""
+        """One row per monitor and satellite that it tested, for JSON; of protection levels one where some were infinite."""
         p_fa = {
             "innovation": self.spec.innovation.p_false_alarm if self.spec.innovation else None,
             "raim": self.spec.raim.p_false_alarm if self.spec.raim else None,
             "als": P_NOISE,
             "noise_rmd": P_NOISE,
         }
-        return [row for name, alarms in self.alarms.items() for row in alarms.report(name, p_fa.get(name))]
+        said = [(n, a) for n, a in self.alarms.items() if n != LEVELS or a.unavailable_epochs]
+        return [row for name, alarms in said for row in alarms.report(name, p_fa.get(name))]

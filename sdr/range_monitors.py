@@ -198,10 +198,17 @@ class RangeMonitors:
         row = np.zeros(1, PROTECTION)
         row["sample_index"], row["t_s"] = sample, t_s
         row["hal_m"], row["val_m"] = limits.hal_m, limits.val_m
+        alarms = self.alarms["protection"]
         try:
-            row["hpl_m"], row["vpl_m"] = quick_levels(np.column_stack([enu, clocks]), var[use], limits)
-        except (ValueError, np.linalg.LinAlgError):
-            row["hpl_m"] = row["vpl_m"] = np.inf
+            levels, alarms.reason = quick_levels(np.column_stack([enu, clocks]), var[use], limits), None
+            if not math.isfinite(sum(levels)):
+                alarms.lack(
+                    "a fault of one satellite would not be seen by the others: its protection level is infinite"
+                )
+        except ValueError as error:
+            levels = math.inf, math.inf
+            alarms.lack(str(error))
+        row["hpl_m"], row["vpl_m"] = levels
         out["protection"] = row
 
 

@@ -14,6 +14,7 @@ from nav.navlog import REMEDY, Remedy
 from sdr.integrity import IntegritySpec, Limits
 from sdr.respond import RespondSpec
 from sdr.scenario import ReceiverSpec
+from sdr.watch.post import report_lines
 from signals.constants import METRES_PER_CHIP
 from tracking.lock import STATE_LOCKED
 from tracking.records import EPOCH
@@ -297,7 +298,24 @@ def test_too_few_satellites_are_said_and_the_receiver_goes_on():
     )
     for name in ("innovation", "als", "parallel_filters"):
         assert "Kalman" in report[name]["unavailable"] and report[name]["tests"] == 0
-    assert np.all(np.isfinite(rows["protection"]["hpl_m"]))
+    assert np.all(np.isfinite(rows["protection"]["hpl_m"])) and "protection" not in report
+
+
+def test_an_infinite_protection_level_is_said_once():
+    """Four satellites of one constellation: no level, one row and one line that say why; with a fifth it is gone."""
+    sky = make_sky(duration_s=60.0, signals=("L1CA",), max_satellites=4, ionosphere="none")
+    _, _, run, rows, _ = fly(sky, LEAST_SQUARES, {"raim": None, "protection": {}}, n=15)
+    assert len(rows["protection"]) == 3 and np.all(np.isinf(rows["protection"]["vpl_m"]))
+    (said,) = [m for m in run.report() if m["name"] == "protection"]
+    assert "5 satellites" in said["unavailable"] and said["unavailable_epochs"] == 3
+    assert sum("protection" in line for line in report_lines(run.report(), [])) == 1
+    snap, far = run._navigator.snapshot, np.array([[0.6, 0.0, 0.8]])
+    more = snap._replace(
+        names=[*snap.names, "G99"], los=np.vstack([snap.los, far]), second=np.zeros(5), residual_m=np.zeros(5),
+        variance_m2=np.ones(5), own_m2=np.ones(5), use=np.ones(5, bool),
+    )  # fmt: skip
+    run._ranges(more, 0, 60.0, out := {})
+    assert np.isfinite(out["protection"]["vpl_m"][0]) and run.alarms["protection"].reason is None
 
 
 @pytest.mark.parametrize(
