@@ -1,8 +1,8 @@
-"""Bank of bias hypotheses on one satellite at a time (seed 002), in log probabilities with a floor.
+"""Bank of bias hypotheses on one satellite at a time (Abdel-Hafez bias), in log probabilities with a floor.
 
 The innovation of a biased epoch is r = H eps + v + mu e_i. The projector N = I - H (H'H)^-1 H' removes the filter's
 error; its non-trivial right singular vectors V1 (m - rank H rows) give rt = V1 r with mean mu V1[:, i] and covariance
-Gamma = V1 R V1' (seed 002, eq. 10-17; eq. 17 is a covariance, so it is centred, and R need not be sigma^2 I).
+Gamma = V1 R V1' (Abdel-Hafez bias, eq. 10-17; eq. 17 is a covariance, so it is centred, and R need not be sigma^2 I).
 The Gaussian exponent needs no decomposition at run time: with
 
     W = V1' Gamma^-1 V1 = R^-1 - R^-1 H (H' R^-1 H)^-1 H' R^-1 ,
@@ -14,9 +14,8 @@ clean time; delay ~ max[(ln(1/floor) + ln 99) / D_null, ln 99 / D_neighbour], D 
 """
 
 import math
-from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -37,13 +36,13 @@ def chi2_limit(dof: int, p: float) -> float:
 
 
 def projector(h: np.ndarray) -> np.ndarray:
-    """N = I - H (H'H)^-1 H' (seed 002, eq. 10); H (m, q) without zero columns, full rank."""
+    """N = I - H (H'H)^-1 H' (Abdel-Hafez bias, eq. 10); H (m, q) without zero columns, full rank."""
     q, _ = np.linalg.qr(geometry(h))
     return np.eye(h.shape[0]) - q @ q.T
 
 
 def parity_rows(h: np.ndarray) -> np.ndarray:
-    """V1 (m - q, m): right singular vectors of the projector with singular value 1 (seed 002, eq. 12)."""
+    """V1 (m - q, m): right singular vectors of the projector with singular value 1 (Abdel-Hafez bias, eq. 12)."""
     hg = geometry(h)
     _, _, vt = np.linalg.svd(projector(hg))
     return vt[: hg.shape[0] - hg.shape[1]]
@@ -263,7 +262,7 @@ def ranges_epoch(log_p, chi2, dof, count, at, r, h, var, used, row, bias_m, log_
 
 @njit(cache=True, nogil=True)
 def update_linear(p, w, r, row, bias_m, log_norm):
-    """Seed 002, eq. 18-19 as printed, in linear probabilities: a labelled comparison. 0/0 gives NaN, as it would."""
+    """Abdel-Hafez bias, eq. 18-19 as printed, in linear probabilities: a labelled comparison. 0/0 gives NaN, as it would."""
     m = r.size
     wr = np.zeros(m)
     null = 0.0
@@ -322,7 +321,7 @@ def hypotheses(grid_m: np.ndarray, m: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def log_normaliser(h: np.ndarray, r_cov: np.ndarray) -> float:
-    """-1/2 ln((2 pi)^n |Gamma|) of the density in seed 002, eq. 18."""
+    """-1/2 ln((2 pi)^n |Gamma|) of the density in Abdel-Hafez bias, eq. 18."""
     v1 = parity_rows(h)
     gamma = v1 @ (np.diag(r_cov) if np.ndim(r_cov) == 1 else r_cov) @ v1.T
     return -0.5 * (v1.shape[0] * math.log(2 * math.pi) + np.linalg.slogdet(gamma)[1])
@@ -359,8 +358,7 @@ class BiasBank(BaseModel):
         return BiasBankRun(self, m)
 
 
-@dataclass(frozen=True)
-class BiasReport:
+class BiasReport(NamedTuple):
     """State of the bank after one epoch.
 
     ``probability`` (M,) with ``row``, ``bias_m`` (M,); ``best`` the most probable hypothesis; ``fits`` whether the

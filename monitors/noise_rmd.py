@@ -1,4 +1,4 @@
-"""Measurement-noise variance from redundant measurements (seed 001, section 3.4): differences cancel all but noise.
+"""Measurement-noise variance from redundant measurements (Vanek 1999, section 3.4): differences cancel all but noise.
 
 Two channels with independent noise: d = v - v', R = E[d^2] / 2 (eq. 37-41). On shared IF samples two identical channels
 have *identical* noise and d = 0, so the live form uses interleaved halves (even and odd code periods, alternate codes
@@ -27,8 +27,8 @@ SCHEMES = {"printed": PRINTED, "unbiased": UNBIASED, "age_weighted": AGE_WEIGHTE
 def window_variance(ring, count, scheme, decay):
     """Mean square of the last min(count, N) differences in ``ring`` (N,), newest at (count - 1) mod N.
 
-    printed: / (n - 1), though the mean is known to be zero (seed 001, eq. 39); unbiased: / n; age-weighted: weights
-    decay^age (seed 001, section 5.2.1).
+    printed: / (n - 1), though the mean is known to be zero (Vanek 1999, eq. 39); unbiased: / n; age-weighted: weights
+    decay^age (Vanek 1999, section 5.2.1).
     """
     n = min(count, ring.size)
     acc = 0.0
@@ -48,7 +48,7 @@ def window_variance(ring, count, scheme, decay):
 
 @njit(cache=True, nogil=True)
 def tuned_variance(ring, count, scheme, decay, divisor, r0, short, ratio):
-    """R_f = R-hat + R0 (seed 001, eq. 56); with ``short`` > 0 R0 follows a rise that the long window lags behind.
+    """R_f = R-hat + R0 (Vanek 1999, eq. 56); with ``short`` > 0 R0 follows a rise that the long window lags behind.
 
     The last ``short`` differences raise R0 by R_short - R-hat when R_short > ratio R-hat.
     """
@@ -157,10 +157,23 @@ def follow(epochs, counts, slot, ring, done, last):
 
 
 @njit(cache=True, nogil=True)
-def window_variances(ring, done, scheme, decay, out):
-    """``window_variance`` of every row of ``ring`` (S, N) into ``out`` (S,)."""
+def window_variances(ring, done, last, own_bw, steered, scheme, decay, key, out):
+    """``window_variance`` of every row of ``ring`` (S, N) that is full and was heard since the last call into ``out`` (S,), else NaN.
+
+    ``own_bw`` (S,) loop bandwidths where the integrations tell none. ``key`` (S, 3): what the loop's share depends on, C/N0 in
+    whole dB-Hz, samples and bandwidth (0 if ``steered``). Returns which keys are new.
+    """
+    new = np.zeros(out.size, np.bool_)
     for s in range(out.size):
-        out[s] = window_variance(ring[s], done[s], scheme, decay)
+        out[s] = math.nan
+        if last[s, 5] > 0.0 and done[s] >= ring.shape[1]:
+            bw = 0.0 if steered else (last[s, 4] if last[s, 4] != 0.0 else own_bw[s])
+            cn0 = np.rint(last[s, 3])
+            new[s] = cn0 != key[s, 0] or last[s, 2] != key[s, 1] or bw != key[s, 2]
+            key[s, 0], key[s, 1], key[s, 2] = cn0, last[s, 2], bw
+            out[s] = window_variance(ring[s], done[s], scheme, decay)
+        last[s, 5] = -1.0
+    return new
 
 
 class DiscriminatorNoise:
@@ -174,7 +187,8 @@ class DiscriminatorNoise:
         self._channels: dict[tuple[str, int], int] = {}
         self._slot = np.zeros(0, np.int64)
         self._names: list[str] = []
-        self._loops: list[tuple[float, float]] = []
+        self._spacing: list[float] = []
+        self._bw, self._share, self._key = np.zeros(0), np.zeros(0), np.zeros((0, 3))
         self._ring = np.zeros((0, spec.window))
         self._done, self._last = np.zeros(0, np.int64), np.zeros((0, 6))
 
@@ -193,33 +207,26 @@ class DiscriminatorNoise:
             if name not in self._names:
                 spec = loops.l1ca if signal == "L1CA" else loops.e1
                 self._names.append(name)
-                self._loops.append((spec.early_late_space_chips, spec.dll_bw_hz))
+                self._spacing.append(spec.early_late_space_chips)
+                self._bw = np.append(self._bw, spec.dll_bw_hz)
             self._slot[c] = self._names.index(name)
         more = len(self._names) - len(self._done)
         self._ring = np.pad(self._ring, ((0, more), (0, 0)))
-        self._done = np.pad(self._done, (0, more))
+        self._done, self._share = np.pad(self._done, (0, more)), np.pad(self._share, (0, more))
+        self._key = np.pad(self._key, ((0, more), (0, 0)))
         self._last = np.pad(self._last, ((0, more), (0, 0)), constant_values=-1.0)
 
     def estimate(self, steered: bool = False) -> dict[str, float]:
         """Variances, m^2, by satellite, of those heard since the last call; ``steered``: from outside."""
         mean = np.empty(len(self._names))
-        window_variances(self._ring, self._done, SCHEMES[self.spec.scheme], self.spec.decay, mean)
-        out = {}
-        rows = zip(self._names, self._loops, self._done.tolist(), self._last.tolist(), mean.tolist())
-        for name, (spacing, bw_hz), done, (_, _, samples, cn0_dbhz, now_hz, locked), chips2 in rows:
-            if locked <= 0 or done < self.spec.window:
-                continue
-            bw_hz = 0.0 if steered else now_hz or bw_hz
-            share = _share(name[0], spacing, round(cn0_dbhz), samples / self.fs_hz, bw_hz)
-            out[name] = chips2 * METRES_PER_CHIP**2 * share + self.spec.r0_m2
-        self._last[:, 5] = -1.0
-        return out
-
-
-@lru_cache(maxsize=512)
-def _share(system: str, spacing_chips: float, cn0_dbhz: float, t_s: float, dll_bw_hz: float) -> float:
-    """``loop_share`` at the discriminator's gain."""
-    return loop_share(dll_bw_hz, t_s, code_gain(system, spacing_chips, cn0_dbhz, t_s))
+        how = SCHEMES[self.spec.scheme], self.spec.decay
+        new = window_variances(self._ring, self._done, self._last, self._bw, steered, *how, self._key, mean)
+        for s in np.flatnonzero(new):
+            cn0_dbhz, samples, bw_hz = self._key[s].tolist()
+            gain = code_gain(self._names[s][0], self._spacing[s], cn0_dbhz, samples / self.fs_hz)
+            self._share[s] = loop_share(bw_hz, samples / self.fs_hz, gain)
+        var = mean * METRES_PER_CHIP**2 * self._share + self.spec.r0_m2
+        return {n: v for n, v in zip(self._names, var.tolist()) if v == v}
 
 
 def loop_share(dll_bw_hz: float, integration_s: float, gain: float = 1.0) -> float:

@@ -19,28 +19,29 @@ from nav.navlog import EXCLUDED_M2
 
 
 @njit(cache=True, nogil=True)
-def gather(phi, qd, h, z, own, dx, gain, total_phi, total_qd, moved, row, mean, info, count):
-    """One epoch of the filter into the window's sums, in place.
+def gather(at, phi, qd, h, z, own, dx, gain, total_phi, total_qd, moved, row, mean, info, count):
+    """Epochs ``at`` (k,) of the filter's rings into the window's sums, in place.
 
-    ``h`` (m, n), ``z``, ``own`` (m,) the receiver's own variances, 0 where there was nothing; ``gain`` (m,) the column of
+    ``h`` (E, m, n), ``z``, ``own`` (E, m) the receiver's own variances, 0 where there was nothing; ``gain`` (m,) the column of
     each row's clock; ``total_*``, ``moved`` (n,): transition, process noise and corrections since the window began;
     ``row`` (m, n) newest row of unit gain; ``mean``, ``info``, ``count`` (m,): sums of w z'/g, of w = g^2/own, and of epochs.
     """
-    eskf_kernels.chain(total_phi, total_qd, phi, qd)
-    moved[:] = np.dot(phi, moved)
-    for i in range(z.size):
-        g = h[i, gain[i]]
-        if own[i] <= 0.0 or g <= 0.0:
-            continue
-        value = z[i]
+    for e in at:
+        eskf_kernels.chain(total_phi, total_qd, phi[e], qd[e])
+        moved[:] = np.dot(phi[e], moved)
+        for i in range(count.size):
+            g = h[e, i, gain[i]]
+            if own[e, i] <= 0.0 or g <= 0.0:
+                continue
+            value = z[e, i]
+            for j in range(moved.size):
+                value += h[e, i, j] * moved[j]
+                row[i, j] = h[e, i, j] / g
+            mean[i] += value * g / own[e, i]
+            info[i] += g * g / own[e, i]
+            count[i] += 1
         for j in range(moved.size):
-            value += h[i, j] * moved[j]
-            row[i, j] = h[i, j] / g
-        mean[i] += value * g / own[i]
-        info[i] += g * g / own[i]
-        count[i] += 1
-    for j in range(moved.size):
-        moved[j] += dx[j]
+            moved[j] += dx[e, j]
 
 
 @njit(cache=True, nogil=True)
@@ -59,8 +60,25 @@ def divide(kept, count, info, mean, row, scale, z, h, own, seen, single, r_used,
             h_used[i, j] = row[i, j] if used[i] else 0.0
 
 
+@njit(cache=True, nogil=True)
+def finish(
+    kept, scale, prior, known, total_phi, total_qd, moved, row, mean, info, count, z, h, own, seen, single, dx, phi, qd, p,
+    h_used, k, r_used, var, used,
+):  # fmt: skip
+    """End of a window: ``divide``; with ``known`` covariance ``prior`` at its start, the log's epoch; the sums begin anew."""
+    divide(kept, count, info, mean, row, scale, z, h, own, seen, single, r_used, h_used, var, used)
+    dx[:] = moved
+    if known:
+        phi[:], qd[:] = total_phi, total_qd
+        eskf_kernels.predict(prior, phi, qd)
+        p[:] = prior
+        eskf_kernels.update(prior, h_used, var, used, r_used, k, np.empty(dx.size))
+    total_phi[:], total_qd[:], moved[:] = np.eye(dx.size), 0.0, 0.0
+    mean[:], info[:], count[:] = 0.0, 0.0, 0
+
+
 class NormalPoints:
-    """Log of a steering filter with the face of ``nav.navlog.NavigatorLog``: ``add`` every epoch, ``close`` a window.
+    """Log of a steering filter with the face of ``nav.navlog.NavigatorLog``: ``add`` its epochs, ``close`` a window.
 
     After ``close``: ``z`` (2S,), ``h`` (2S, n), ``own`` (2S,), ``seen`` (2S,), ``dx`` what the filter corrected in all,
     ``epochs`` of the window and ``single`` (2S,) the mean variance of one of them.
@@ -77,20 +95,13 @@ class NormalPoints:
         self._ring = empty_log(length, n, m)
         self._views = epochs_of(self._ring)
         self._start: np.ndarray | None = None
-        self._open()
-
-    def _open(self) -> None:
-        n, m = self.dx.size, self.z.size
-        self._phi, self._qd, self._moved = np.eye(n), np.zeros((n, n)), np.zeros(n)
-        self._row, self._mean, self._info = np.zeros((m, n)), np.zeros(m), np.zeros(m)
-        self._n = np.zeros(m, np.int64)
-
-    def add(self, phi, qd, h, z, own, dx) -> None:
-        """One epoch of the filter."""
-        gather(
-            phi, qd, h, z, own, dx, self._gain, self._phi, self._qd, self._moved, self._row, self._mean, self._info,
-            self._n,
+        self._sums = (
+            np.eye(n), np.zeros((n, n)), np.zeros(n), np.zeros((m, n)), np.zeros(m), np.zeros(m), np.zeros(m, np.int64)
         )  # fmt: skip
+
+    def add(self, at, phi, qd, h, z, own, dx) -> None:
+        """Epochs ``at`` (k,) of the filter's rings, see ``gather``."""
+        gather(at, phi, qd, h, z, own, dx, self._gain, *self._sums)
 
     def close(self, t_s: float, names: list[str | None], scale: np.ndarray, p: np.ndarray) -> bool:
         """End the window: rows of ``names`` (S,), variances times ``scale`` (2S,); ``p`` (n, n) the filter's covariance now.
@@ -101,23 +112,18 @@ class NormalPoints:
         # A slot that changed hands within the window holds two satellites' ranges.
         kept = np.array([a == b for a, b in zip(names, self.names)])
         log = self._views[self.count % self.length]
-        divide(
-            kept, self._n, self._info, self._mean, self._row, scale, self.z, self.h, self.own, self.seen, self.single, log.r,
-            log.h, log.var, log.used,
+        self.names, self.epochs = list(names), int(max(self._sums[-1].max(), 1))
+        finish(
+            kept, scale, self._start if first is None else first, first is not None, *self._sums, self.z, self.h, self.own,
+            self.seen, self.single, self.dx, log.phi, log.qd, log.p, log.h, log.k, log.r, log.var, log.used,
         )  # fmt: skip
-        self.names, self.epochs, self.dx = list(names), int(max(self._n.max(), 1)), self._moved
-        if first is not None:
-            eskf_kernels.predict(first, self._phi, self._qd)
-            log.t_s[...], log.phi[:], log.qd[:], log.p[:] = t_s, self._phi, self._qd, first
-            eskf_kernels.update(first, log.h, log.var, log.used, log.r, log.k, np.empty_like(self.dx))
-            self.count += 1
-        self._open()
+        log.t_s[...] = t_s
+        self.count += first is not None
         return first is not None
 
     def restart(self, p: np.ndarray) -> None:
-        """Forget the epochs: the filter has another covariance, ``p``, from now on."""
+        """Forget the epochs: the filter has another covariance, ``p``, since the last window ended just now."""
         self.count, self._start = 0, p.copy()
-        self._open()
 
     def last(self) -> EpochLog:
         """The last normal point (views, ``s`` empty)."""

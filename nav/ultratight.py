@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from nav import ultratight_kernels as kernels
 from nav.eskf import EpochLog, empty_log, epochs_of, newest
 from nav.frames import earth_radii
-from nav.imu import BarometerSpec, ecef17_of, pinson13_of
+from nav.imu import G0_MPS2, BarometerSpec, ecef17_of, pinson13_of
 from nav.riss import DEG_H, HEIGHT, LAT, Riss11, RissSf, riss_nominal
 from nav.strapdown import attitude_from_velocity, coarse_attitude
 from signals.modulation import chip_acf
@@ -179,18 +179,23 @@ def model_code(model) -> int:
 
 
 def model_rates(model, barometer=None) -> np.ndarray:
-    """What ``kernels.predict`` calls rates (3,): inverse correlation times of a model's bias states, and the barometer."""
+    """What ``kernels.predict`` calls rates (4,): inverse correlation times of a model's bias states; barometer or matrix errors."""
     if hasattr(model, "rates_per_s"):
         own = model.rates_per_s
     elif model.kind == "ecef17":
-        own = np.array([1.0 / model.accel_bias_tau_s, 1.0 / model.gyro_bias_tau_s])
+        own = np.array(
+            [
+                1.0 / model.accel_bias_tau_s, 1.0 / model.gyro_bias_tau_s, model.scale_sigma**2,
+                model.misalignment_sigma_rad**2,
+            ]
+        )  # fmt: skip
     elif model.kind == "pinson13":
         own = np.array(
             [model.baro_rate_per_s, model.baro_gain_per_s, (barometer or BarometerSpec()).noise_m ** 2]
         )
     else:
         own = np.zeros(0)
-    return np.concatenate([own, np.zeros(3 - own.size)])
+    return np.concatenate([own, np.zeros(4 - own.size)])
 
 
 def build_model(spec: SteeringSpec, imu=None, odometer=None, barometer=None):
@@ -246,14 +251,17 @@ def nominal_of(
             )
             x[6:15] = c.ravel()
             x[21], x[22] = bias_m, drift_mps
-            x[kernels.BARO_HEIGHT] = np.nan
+            x[kernels.BARO_HEIGHT] = x[kernels.USUAL : kernels.USUAL + 6] = np.nan
     return x
 
 
 def start_covariance(
-    model, x, pos_m=5.0, vel_mps=0.3, bias_m=10.0, drift_mps=1.0, heading_rad=0.05, isb_m=10.0, imu=None
+    model, x, pos_m=5.0, vel_mps=0.3, bias_m=10.0, drift_mps=1.0, heading_rad=0.05, isb_m=10.0, imu=None, fix_m2=None
 ):
-    """Start covariance (n + 1, n + 1) of true - estimate: a scalar fix, a heading from its velocity, sensors unknown."""
+    """Start covariance (n + 1, n + 1) of true - estimate: a scalar fix, a heading from its velocity, sensors unknown.
+
+    ``fix_m2`` (3, 3): covariance of the fix in ECEF, in no direction below ``pos_m`` squared; None: ``pos_m`` level, twice that up.
+    """
     code, n = model_code(model), model.n + 1
     s = np.zeros(n)
     ib, idr = kernels.clock_states(code)
@@ -278,10 +286,19 @@ def start_covariance(
         s[0:3], s[3:6] = 2.0 * pos_m, vel_mps
         if code == kernels.ECEF17:
             s[6:9] = heading_rad
-            s[9:12] = math.hypot(*imu.accel_bias_si) if imu else 0.05
+            force = G0_MPS2 * math.hypot(model.scale_sigma, model.misalignment_sigma_rad)  # of 1 g
+            s[9:12] = math.hypot(*imu.accel_bias_si, force) if imu else 0.05
             s[12:15] = math.hypot(*imu.gyro_bias_si) if imu else 1e-4
             s[9:15] = np.maximum(s[9:15], [1e-3] * 3 + [1e-6] * 3)
-    return np.diag(s * s)
+    p = np.diag(s * s)
+    if fix_m2 is not None:
+        tp, unused = np.empty((2, 3, n))
+        kernels.maps(code, x, tp, unused)
+        at = [0, 1, 9] if code == kernels.PINSON else [0, 1, 2]
+        size, axes = np.linalg.eigh(fix_m2)
+        half = np.linalg.solve(tp[:, at], axes * np.sqrt(np.maximum(size, pos_m**2)))
+        p[np.ix_(at, at)] = half @ half.T
+    return p
 
 
 def extended_q(model, x) -> np.ndarray:
@@ -293,8 +310,8 @@ def extended_q(model, x) -> np.ndarray:
 class Filter:
     """State and workspace of one steering filter for C channel slots.
 
-    ``log`` is what the monitors read, and ``own`` (2C,): the last epoch's variances before any answer of theirs, 0 where a
-    channel was not heard; ``extra`` (n, n) is what their corrections may be wrong by, which no gain knows, or None.
+    ``log`` is what the monitors read, and of each epoch its corrections ``dx`` and ``own`` (2C,), the variances before any answer of
+    theirs, 0 where a channel was not heard; ``extra`` (n, n) is what their corrections may be wrong by, which no gain knows, or None.
     """
 
     def __init__(self, spec: SteeringSpec, model, x, p, n_channels, log_length=256, barometer=None):
@@ -303,7 +320,7 @@ class Filter:
         n, m = p.shape[0], 2 * n_channels
         self.rates, self.q = model_rates(model, barometer), extended_q(model, x)
         self.filter_s = getattr(model, "pitch_filter_s", 1.0)
-        self.f, self.dx = np.zeros((n, n)), np.zeros(n)
+        self.f = np.zeros((n, n))
         self.power, self.cn0 = np.zeros((n_channels, kernels.N_CN0)), np.full(n_channels, 1e4)
         self.rho, self.rate, self.accel = (
             np.full(n_channels, 2.2e7),
@@ -311,25 +328,34 @@ class Filter:
             np.zeros(n_channels),
         )
         self.los = np.zeros((n_channels, 3))
-        self.own, self.extra = np.zeros(m), None
+        self.extra = None
         self.nis, self.n_rows, self.epochs, self._first = math.nan, 0, 0, 0
-        self._ring = empty_log(log_length, n, m)
+        self._ring, self._own, self._dx = (
+            empty_log(log_length, n, m),
+            np.zeros((log_length, m)),
+            np.zeros((log_length, n)),
+        )
         self._views = epochs_of(self._ring)
+        self.own, self.dx = self._own[0], self._dx[0]
 
     def slot(self, t_s: float) -> EpochLog:
         """Views of the log's next row, of time ``t_s``."""
         i = self.epochs % self._ring.t_s.size
         self.epochs += 1
+        self.own, self.dx = self._own[i], self._dx[i]
         self._ring.t_s[i] = t_s
         return self._views[i]
 
     def log(self, n_epochs: int | None = None) -> EpochLog:
-        """The last ``n_epochs`` epochs, oldest first (copies)."""
-        return newest(self._ring, self.epochs, n_epochs, self.epochs - self._first)
+        """The last ``n_epochs`` epochs, oldest first (copies, ``s`` left out)."""
+        ring = self._ring._replace(s=np.zeros((self._ring.n_epochs, 0, 0)))
+        return newest(ring, self.epochs, n_epochs, self.epochs - self._first)
 
-    def last(self) -> EpochLog:
-        """The last epoch (views)."""
-        return self._views[(self.epochs - 1) % self._ring.t_s.size]
+    def since(self, epoch: int) -> tuple[np.ndarray, ...]:
+        """Rows of all epochs after the first ``epoch``, and the rings that they are rows of: phi, qd, h, r, own, dx."""
+        ring = self._ring
+        at = np.arange(epoch, self.epochs) % ring.n_epochs
+        return at, ring.phi, ring.qd, ring.h, ring.r, self._own, self._dx
 
     def correct(self, dx: np.ndarray | None, p: np.ndarray | None) -> None:
         """Between two epochs: inject dx = true - estimate, replace the covariance; what was logged is another filter's."""

@@ -110,7 +110,7 @@ class IntegrityLive:
             return
         if self.steered is None or self.steered.filter is not steering.filter:
             self.steered = SteeringWatch(steering, max(self._log_epochs(), MEMORY))
-        self.steered.gather()
+        self.steered.hear()
 
     def _log_epochs(self) -> int:
         return 0 if self.spec.als is None else self.spec.als.window_epochs + self.spec.als.settle_epochs

@@ -18,6 +18,9 @@ from nav.navigator import Navigator, Snapshot
 from nav.navlog import EXCLUDED_M2, NavigatorLog, Remedy
 from nav.steering import LEFT_OUT, SLOTS, Steering
 
+AT_ONCE = 50
+"""Most epochs of a steering filter that wait to be gathered."""
+
 
 class NavigatorWatch:
     """The navigator: least squares, or its Kalman filter where ``length`` epochs of a log are wanted."""
@@ -87,19 +90,30 @@ class SteeringWatch:
         self.points = NormalPoints(f.p.shape[0], SLOTS, clock, drift, length)
         self._gain = np.repeat(np.array([clock, drift]), SLOTS)
         self._single: deque[np.ndarray] = deque(maxlen=length)
-        self.fresh, self._ready = 0, False
+        self.fresh, self._ready, self._epoch = 0, False, steering.filter.epochs - 1
+        self._name: list[tuple[str, int] | None] = []
+        self._names: list[str | None] = []
 
     def gather(self) -> None:
-        """Take the filter's newest epoch into the window."""
-        f = self.filter
-        log = f.last()
-        self.points.add(log.phi, log.qd, log.h, log.r, f.own, f.dx)
+        """Take the filter's newest epochs into the window."""
+        self.points.add(*self.filter.since(self._epoch))
+        self._epoch = self.filter.epochs
+
+    def hear(self) -> None:
+        """The filter finished an epoch; they are gathered together, long before its log forgets them."""
+        if self.filter.epochs - self._epoch >= AT_ONCE:
+            self.gather()
 
     def look(self, sample: int) -> bool:
         """End the window at ``sample``; False when it does not count."""
         st = self.steering
-        names = [None if n is None else f"{'G' if n[0] == 'L1CA' else 'E'}{n[1]:02d}" for n in st.name]
-        self._ready = self.points.close(sample / st.fs_hz, names, st.inflate, self.filter.p)
+        if st.name != self._name:
+            self._name = list(st.name)
+            self._names = [
+                None if n is None else f"{'G' if n[0] == 'L1CA' else 'E'}{n[1]:02d}" for n in st.name
+            ]
+        self.gather()
+        self._ready = self.points.close(sample / st.fs_hz, self._names, st.inflate, self.filter.p)
         self.fresh = self.points.epochs
         self._single.append(self.points.single.copy())
         return self._ready
@@ -138,15 +152,17 @@ class SteeringWatch:
         four times the usual, are not looked at (they stay in the filter's gains).
         """
         log = self.filter.log(n)
-        e = np.arange(SLOTS * 2)
-        g = log.h[:, e, self._gain]
+        g = log.h[:, np.arange(SLOTS * 2), self._gain]
         told = log.used & (g > 0) & (log.var < 0.5 * EXCLUDED_M2)
         usual = np.array([np.median(x[t]) if t.any() else 0.0 for x, t in zip(g.T, told.T)])
         used = told & (g > 0.5 * usual)
-        g = np.where(told, g, 1.0)
-        return log._replace(
-            h=log.h / g[:, :, None], k=log.k * g[:, None, :], r=log.r / g, var=log.var / g**2, used=used
-        )
+        g[~told] = 1.0
+        # In place: these are megabytes.
+        np.divide(log.h, g[:, :, None], out=log.h)
+        np.multiply(log.k, g[:, None, :], out=log.k)
+        np.divide(log.r, g, out=log.r)
+        np.divide(log.var, g**2, out=log.var)
+        return log._replace(used=used)
 
     def claimed(self, n: int) -> np.ndarray:
         """(2S,) the receiver's own variances of one innovation, mean over about the last n epochs."""

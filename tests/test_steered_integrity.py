@@ -67,7 +67,8 @@ def test_a_normal_point_is_the_weighted_noise_and_the_error_at_the_windows_start
             z = rows @ eps + v[k]
             filt.predict(np.eye(n), 1e-3 * np.eye(n))
             dx = filt.update(z, rows, np.full(2 * slots, 2.0)).copy()
-            points.add(np.eye(n), 1e-3 * np.eye(n), rows, z, np.full(2 * slots, 2.0), dx)
+            epoch = np.eye(n), 1e-3 * np.eye(n), rows, z, np.full(2 * slots, 2.0), dx
+            points.add(np.zeros(1, int), *(array[None] for array in epoch))
             eps = eps - dx
         assert points.close(window * 1.0, names, np.ones(2 * slots), filt.p) == (window > 0)
         if window == 0:
