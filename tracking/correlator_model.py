@@ -26,7 +26,13 @@ from signals.codes import primary_code, secondary_code
 from signals.constants import CHIP_RATE_HZ, CYCLES_PER_CHIP, WAVELENGTH_M
 from signals.modulation import SIGNALS, autocorrelation, chip_waveform
 from signals.multipath import MultipathSpec
-from tracking.discriminators import CARRIER_DISCRIMINATORS, CODE_DISCRIMINATORS, code_scale_chips
+from tracking.discriminators import (
+    CARRIER_DISCRIMINATORS,
+    CODE_DISCRIMINATORS,
+    CarrierDiscriminator,
+    EarlyLateDiscriminator,
+    code_scale_chips,
+)
 from tracking.loops import dll_gains, pll_gains
 from tracking.twin_kernels import (
     BLOCK_EPOCHS,
@@ -172,8 +178,8 @@ class Twin(_Spec):
     dll_bandwidth_hz: float = Field(1.0, gt=0)
     pll_bandwidth_hz: float = Field(10.0, gt=0)
     pll_order: Literal[2, 3] = 3
-    carrier_discriminator: Literal["costas_atan", "costas_product", "four_quadrant"] = "costas_atan"
-    code_discriminator: Literal["dot_product", "envelope", "power", "coherent"] = "dot_product"
+    carrier_discriminator: CarrierDiscriminator = "costas_atan"
+    code_discriminator: EarlyLateDiscriminator = "dot_product"
     data: bool = False  # random symbols (L1CA 20 ms, E1B 4 ms); E1C: the secondary code
     wiped: bool = False  # the channel removes the signs again
     doppler_hz: float = Field(0.0, ge=-1e5, le=1e5)

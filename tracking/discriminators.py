@@ -3,8 +3,8 @@ code.
 
 ``kernels.py`` compiles these functions into its own cache entry; numba does not notice a change in *this*
 file, so clear ``tracking/__pycache__`` after editing it. To add one: write the function, give it a code, add
-a branch to the selecting function below it, and name it in ``CARRIER_DISCRIMINATORS`` or
-``CODE_DISCRIMINATORS``.
+a branch to the selecting function below it (a code discriminator: and to ``code_scale_chips``), and name it in
+the type that the scenario's keys have and in ``CARRIER_DISCRIMINATORS`` or ``CODE_DISCRIMINATORS``.
 
 Signs (``tracking.records``): phase, frequency and code errors are positive where the incoming signal is ahead
 of the replica. E is the replica advanced by half the early-late spacing, so an incoming code that is ahead
@@ -12,12 +12,17 @@ favours E.
 """
 
 import math
+from typing import Literal
 
 from numba import njit
 
 __all__ = [
     "CARRIER_DISCRIMINATORS",
     "CODE_DISCRIMINATORS",
+    "CarrierDiscriminator",
+    "CodeDiscriminator",
+    "CostasDiscriminator",
+    "EarlyLateDiscriminator",
     "carrier_error_cycles",
     "code_error",
     "coherent",
@@ -31,6 +36,11 @@ __all__ = [
     "very_early_late",
 ]
 
+CostasDiscriminator = Literal["costas_atan", "costas_product"]
+"""Carrier discriminators of signals with data."""
+CarrierDiscriminator = Literal[CostasDiscriminator, "four_quadrant"]
+EarlyLateDiscriminator = Literal["envelope", "power", "dot_product", "coherent"]
+CodeDiscriminator = Literal[EarlyLateDiscriminator, "very_early_late"]
 COSTAS_ATAN, COSTAS_PRODUCT, FOUR_QUADRANT = 0, 1, 2
 CARRIER_DISCRIMINATORS = {
     "costas_atan": COSTAS_ATAN,
