@@ -116,13 +116,25 @@ def _cn0(h5: h5py.File, channels: dict[str, h5py.Group], directory: Path) -> Pat
     if not channels:
         return None
     path = directory / "cn0.png"
-    with figure(path, "Carrier-to-noise density") as ax:
+    adapts = any(np.ptp(bw[bw > 0]) > 0 for bw in map(_bandwidth, channels.values()) if (bw > 0).any())
+    with figure(path, "Carrier-to-noise density", rows=3 if adapts else 1) as axes:
         for group in channels.values():
             e = group["epochs"]
-            ax.plot(e["sample_index"] / e.attrs["fs_hz"], e["cn0_dbhz"], lw=0.8, label=channel_name(group))
-        ax.set(xlabel="time (s)", ylabel="C/N0 (dB-Hz)")
-        ax.legend(ncol=8, fontsize=7)
+            t_s, label = e["sample_index"] / e.attrs["fs_hz"], channel_name(group)
+            for ax, key in zip(np.ravel(axes), ("cn0_dbhz", "pll_bw_hz", "dll_bw_hz")):
+                ax.plot(t_s, np.where(e[key] > 0, e[key], np.nan), lw=0.8, label=label)
+        for ax, name in zip(
+            np.ravel(axes), ("C/N0 (dB-Hz)", "PLL bandwidth used (Hz)", "DLL bandwidth used (Hz)")
+        ):
+            ax.set_ylabel(name)
+        np.ravel(axes)[-1].set_xlabel("time (s)")
+        np.ravel(axes)[0].legend(ncol=8, fontsize=7)
     return path
+
+
+def _bandwidth(group: h5py.Group) -> np.ndarray:
+    """Noise bandwidths of the carrier loop in force; 0: steered, pulling in or settling."""
+    return np.asarray(group["epochs"]["pll_bw_hz"])
 
 
 def _iq(h5: h5py.File, channels: dict[str, h5py.Group], directory: Path) -> Path | None:

@@ -1,5 +1,6 @@
 """Loop bandwidths that follow the noise: the law, jitter, continuity, a jam that only they survive, and the hand-over."""
 
+from contextlib import contextmanager
 from itertools import pairwise
 
 import numpy as np
@@ -10,7 +11,7 @@ from sdr import scenario
 from sdr.receiver import Receiver
 from tracking import loops
 from tracking.channel import STATE_LOCKED, AdaptSpec, TrackingSpec
-from tracking.records import AIDING
+from tracking.records import AIDING, EPOCH
 
 FS = 2.048e6
 TEN_MS = {"integration_ms": 10, "pll_bw_hz": 18.0, "dll_bw_hz": 1.0}
@@ -237,3 +238,38 @@ def test_flags_and_variances_reach_the_loops_one_slab_later():
     assert receiver._commands()["weaken"].tolist() == [50.0]
     receiver.position = 11
     assert receiver._commands()["weaken"].tolist() == [0.0]
+
+
+@pytest.mark.parametrize("order", [{"pll_order": 2}, {"dll_order": 2}])
+def test_other_orders_are_refused(order):
+    with pytest.raises(ValueError, match="adapt is made for pll_order = 3 and dll_order = 1"):
+        spec_for(**order).start(FS)
+
+
+@pytest.mark.parametrize("adapts", [True, False])
+def test_bandwidths_used_are_drawn_where_they_follow_the_noise(tmp_path, monkeypatch, adapts):
+    import h5py
+
+    from sdr import plot
+
+    e = np.zeros(100, EPOCH)
+    e["sample_index"], e["cn0_dbhz"], e["dll_bw_hz"] = np.arange(100) * 1000, 40.0, 0.5
+    e["pll_bw_hz"][20:] = np.linspace(15.0, 6.0, 80) if adapts else 15.0  # 0 while it settles
+    drawn, real = [], plot.figure
+
+    @contextmanager
+    def figure(*a, **k):
+        with real(*a, **k) as axes:
+            yield axes
+            drawn.extend(np.ravel(axes))
+
+    monkeypatch.setattr(plot, "figure", figure)
+    with h5py.File(tmp_path / "r.h5", "w") as h5:
+        rows = h5.create_dataset("tracking/G07_L1CA/epochs", data=e)
+        rows.attrs.update(fs_hz=FS, signal="L1CA", prn=7)
+        assert plot._cn0(h5, plot._channels(h5), tmp_path) == tmp_path / "cn0.png"
+    assert len(drawn) == (3 if adapts else 1)
+    if adapts:
+        seen = drawn[1].lines[0].get_ydata()
+        assert np.isnan(seen[:20]).all()
+        np.testing.assert_array_equal(seen[20:], e["pll_bw_hz"][20:])
