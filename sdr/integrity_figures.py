@@ -8,7 +8,10 @@ import numpy as np
 
 from sdr.errors import hermite, levels_and_errors, position_errors
 from sdr.figure import figure
+from signals.geodesy import ecef_to_geodetic, ned_matrix
 
+TAIL_S = 20.0
+"""Error and claim are compared over the last so many seconds."""
 LABELS = {
     "innovation": "innovation²/S",
     "raim": "RAIM / limit",
@@ -55,8 +58,20 @@ def _errors(h5: h5py.File, ax: Any) -> None:
     if "truth/receiver" in h5:
         error = position_errors(solution, h5["truth/receiver"][:], h5["navigation/solution"].attrs["fs_hz"])
         ax.plot(solution["t_s"], np.linalg.norm(error, axis=1), lw=0.9, label="error, 3D")
+        ax.set_title(_honesty(solution, error), fontsize=8)
     ax.set_ylabel("m")
     ax.legend(fontsize=7, loc="upper left")
+
+
+def _honesty(solution: Any, error: np.ndarray) -> str:
+    """Error against claim at the end, where faults stand and answers hold."""
+    late = solution["t_s"] > solution["t_s"][-1] - TAIL_S
+    lat_rad, lon_rad, _ = ecef_to_geodetic(solution["pos_ecef_m"][-1:])
+    enu = ned_matrix(lat_rad[0], lon_rad[0])[[1, 0, 2]] * [[1.0], [1.0], [-1.0]]
+    cov, e = enu @ solution["cov_ecef_m2"][late] @ enu.T, error[late]
+    nees = np.einsum("ei,eij,ej->e", e, np.linalg.inv(cov), e).mean()
+    size, claimed = (np.sqrt(x.mean()) for x in (np.sum(e**2, axis=1), np.trace(cov, axis1=1, axis2=2)))
+    return f"last {TAIL_S:g} s: error {size:.2f} m rms, claimed {claimed:.2f} m, NEES {nees:.1f} of 3"
 
 
 def _answers(h5: h5py.File, ax: Any) -> None:

@@ -191,7 +191,8 @@ CELLS = tuple(
         *(Cell(noise, 0.0, ramp) for ramp in (0.5, 1.0, 2.0)),
     )
 )
-ON_SAMPLES = Cell(30), Cell(10, 10.0), Cell(10, 0.0, 1.0), Cell(30, 20.0), Cell(30, 0.0, 2.0)
+ON_SAMPLES = {Cell(30): 6, Cell(10, 10.0): 5, Cell(10, 0.0, 1.0): 5, Cell(30, 20.0): 1, Cell(30, 0.0, 2.0): 1}
+"""Cells on samples, and of how many seeds."""
 GALILEO = 0.62
 BELIEVED_M = 10.0
 """Range noise that the filter believes where the noise alone is answered."""
@@ -277,17 +278,20 @@ def alarms(run: Any, suspect: str, started_s: float) -> dict[str, Any]:
 
 
 def run(out_dir: Path, quick: bool = False, seed: int = 1) -> list[dict]:
-    """The twin on every cell, 20 flights each (``quick``: 1), and cells on samples, one run each (not ``quick``).
+    """The twin on every cell, 20 flights each (``quick``: 1), and cells on samples, one to six runs each (not ``quick``).
 
     What is done is kept in ``parts``: stopped and called again, it goes on.
     """
     parts, flights = Path(out_dir) / "parts", 1 if quick else FLIGHTS
     twin = [(cell, [_kept(parts, fly_cell, cell, seed + k) for k in range(flights)]) for cell in CELLS]
-    rows = [line for cell, results in twin for line in _rows(cell.label, results)]
-    for cell in () if quick else ON_SAMPLES:
-        rows += _rows(f"on samples, {cell.label}", [_kept(parts, trial, cell, seed)])
+    cells = [(cell.label, results) for cell, results in twin]
+    for cell, runs in () if quick else ON_SAMPLES.items():
+        cells.append(
+            (f"on samples, {cell.label}", [_kept(parts, trial, cell, seed + k) for k in range(runs)])
+        )
+    rows = [line for label, results in cells for line in _rows(label, results)]
     write_table(rows, out_dir, "integrity-live")
-    _figure(twin, out_dir)
+    _figure(cells, out_dir)
     return rows
 
 
@@ -339,19 +343,20 @@ def _rows(label: str, results: list[dict[str, Any]]) -> list[dict]:
     return lines
 
 
-def _figure(twin: list[tuple[Cell, list[dict[str, Any]]]], out_dir: Path) -> None:
-    figure, axes = new_figure(3, 1, (10.0, 9.0), sharex=True)
-    at = np.arange(len(twin))
+def _figure(cells: list[tuple[str, list[dict[str, Any]]]], out_dir: Path) -> None:
+    figure, axes = new_figure(3, 1, (11.0, 9.0), sharex=True)
+    at = np.arange(len(cells))
     for key, ax, label in zip(
-        ("error_m", "nees", "nis"), axes, ("3-D error, last 20 s (m)", "NEES of 3 at the end", "NIS / dof")
+        ("error_m", "nees", "nis"), axes, ("3-D error, last 20 s (m)", "NEES of 3", "NIS / dof")
     ):
         for shift, name in ((-0.2, "off"), (0.2, "on")):
-            values = [np.mean([r[name][key] for r in results]) for _, results in twin]
+            values = [np.mean([r[name][key] for r in results]) for _, results in cells]
             ax.bar(at + shift, values, 0.4, label=f"response {name}")
         ax.set(ylabel=label, yscale="log")
     axes[0].legend(fontsize=8)
-    axes[1].axhspan(*honest(len(twin[0][1])), color="k", alpha=0.2, label="95 % of true claims")
+    low, high = np.array([honest(len(results)) for _, results in cells]).T
+    axes[1].bar(at, high - low, 0.9, low, color="k", alpha=0.2, label="95 % of true claims")
     axes[1].legend(fontsize=8)
     axes[2].axhspan(*NIS, color="k", alpha=0.2)
-    axes[2].set_xticks(at, [cell.label for cell, _ in twin], rotation=40, ha="right", fontsize=7)
+    axes[2].set_xticks(at, [label for label, _ in cells], rotation=40, ha="right", fontsize=7)
     save_figure(figure, out_dir, "integrity-live")
