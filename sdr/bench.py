@@ -273,6 +273,7 @@ JAMMERS = {
     "noise of 10 kHz": 'kind = "Narrowband"\nbandwidth_hz = 1e4',
     "noise of 100 kHz": 'kind = "Narrowband"\nbandwidth_hz = 1e5',
     "noise of 1 MHz": 'kind = "Narrowband"\nbandwidth_hz = 1e6',
+    "noise of 3 MHz": 'kind = "Narrowband"\nbandwidth_hz = 3e6',
 }
 
 
@@ -452,6 +453,7 @@ def _steered(rounds: int) -> tuple[float, float]:
     """
     sky = [
         "jammer=[]",
+        "sky.start=2024-03-01T10:00:58",
         "sky.max_satellites=10",
         "sky.elevation_mask_deg=5",
         f"duration_s={STEERED_FROM_S + STEERED_S}",

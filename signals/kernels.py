@@ -22,7 +22,6 @@ __all__ = [
     "COMPONENT",
     "add_noise",
     "noise_block",
-    "noise_span",
     "quantise_bits",
     "quantise_int8",
     "quantise_int16",
@@ -60,6 +59,7 @@ _F = np.float32
 _I = np.int32
 _U = np.uint32
 _Q = np.uint64
+_GOLDEN = 0x9E3779B97F4A7C15
 
 
 @intrinsic
@@ -148,25 +148,31 @@ def _splitmix64(z):
     return z ^ (z >> _Q(31))
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST)
-def _hashes(hash1, hash2, seed, block, begin, n):
-    """Two 32-bit hashes of the places begin .. begin + n - 1 in a block, under the block's 64-bit key.
+@njit(cache=True, nogil=True)
+def _block_key(seed, block):
+    """64-bit key of a block: splitmix64 of seed and index."""
+    return _splitmix64(_splitmix64(seed + _Q(_GOLDEN)) + (block + _Q(1)) * _Q(_GOLDEN))
 
-    The key is splitmix64 of seed and block index; the hashes are triple32 (C. Wellons, "Prospecting for hash
+
+@njit(cache=True, nogil=True, fastmath=_FAST)
+def _hashes(hash1, hash2, seed, block):
+    """Two 32-bit hashes of every place in a block, under the block's key.
+
+    They are triple32 (C. Wellons, "Prospecting for hash
     functions", 2018) and the finaliser of MurmurHash3 (A. Appleby) upon it.
     """
-    key = _splitmix64(_splitmix64(seed + _Q(0x9E3779B97F4A7C15)) + (block + _Q(1)) * _Q(0x9E3779B97F4A7C15))
+    key = _block_key(seed, block)
     key1 = _U(key >> _Q(32))
     key2 = _U(key & _Q(0xFFFFFFFF))
-    for k in range(begin, begin + n):
+    for k in range(BLOCK):
         x = _mix(_U(k), key1, _U(17), _U(0xED5AD4BB))
         x = _mix(x, _U(0), _U(11), _U(0xAC4C1B51))
         x = _mix(x, _U(0), _U(15), _U(0x31848BAB))
         x = _mix(x, _U(0), _U(14), _U(1))
         y = _mix(x, key2, _U(16), _U(0x85EBCA6B))
         y = _mix(y, _U(0), _U(13), _U(0xC2B2AE35))
-        hash1[_Q(k - begin)] = x
-        hash2[_Q(k - begin)] = _mix(y, _U(0), _U(16), _U(1))
+        hash1[k] = x
+        hash2[k] = _mix(y, _U(0), _U(16), _U(1))
 
 
 UNIT = _F(-1.3862943611)
@@ -213,19 +219,9 @@ def _gaussian(h, g, scale, polynomials):
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST)
-def noise_span(out_i, out_q, at, hash1, hash2, seed, block, begin, n, variance):
-    """Points begin .. begin + n - 1 of a block of white noise into out[at ..]; ``variance`` of I and of Q."""
-    _hashes(hash1, hash2, seed, block, begin, n)
-    # A loop of its own: the integer and the float part overlap better than fused (0.9 against 1.35 ns).
-    scale, p = UNIT * variance, _polynomials()
-    for k in range(n):
-        out_i[_Q(at) + _Q(k)], out_q[_Q(at) + _Q(k)] = _gaussian(hash1[k], hash2[k], scale, p)
-
-
-@njit(cache=True, nogil=True, fastmath=_FAST)
 def noise_block(out_i, out_q, hash1, hash2, seed, block, sigma):
     """Write BLOCK complex Gaussian samples that depend on (seed, block) alone; sigma^2 is the variance of I and of Q."""
-    _hashes(hash1, hash2, seed, block, 0, BLOCK)
+    _hashes(hash1, hash2, seed, block)
     p = _polynomials()
     for k in range(BLOCK):
         x, y = _gaussian(hash1[k], hash2[k], UNIT, p)
@@ -236,7 +232,7 @@ def noise_block(out_i, out_q, hash1, hash2, seed, block, sigma):
 @njit(cache=True, nogil=True, fastmath=_FAST)
 def add_noise(out_i, out_q, hash1, hash2, seed, block, level, at):
     """Add a block of white noise of power level^2 in I and Q together: one value, or from ``at`` on one per SUB samples."""
-    _hashes(hash1, hash2, seed, block, 0, BLOCK)
+    _hashes(hash1, hash2, seed, block)
     p = _polynomials()
     for sub in range(BLOCK // SUB):
         a = level[min(at + sub, len(level) - 1)]

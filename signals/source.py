@@ -14,7 +14,7 @@ from signals.constants import CHIP_RATE_HZ, F_L1_HZ
 from signals.faults import FaultySky
 from signals.frontend import FrontEndSpec
 from signals.inav import encode as encode_inav
-from signals.jammer_kernels import JAMMER
+from signals.jammer_kernels import JAMMER, NARROW, normals
 from signals.kernels import COMPONENT
 from signals.lnav import encode as encode_lnav
 from signals.modulation import BLOCK, code_table
@@ -23,7 +23,7 @@ from signals.records import ECHO_TRUTH, EPHEMERIS, FAULT_TRUTH, JAMMER_TRUTH, TR
 from signals.sky import Propagation, Satellite, Sky
 from signals.synthesis_kernels import synthesise
 
-__all__ = ["CELLS_PER_S", "Cells", "SyntheticSource", "amplitude", "hermite_cells", "truth"]
+__all__ = ["CELLS_PER_S", "Cells", "SyntheticSource", "amplitude", "hermite_cells", "jammer_tables", "truth"]
 
 CELLS_PER_S = 50
 """Cells of 20 ms: a whole number of code periods of every signal, and the grid of the clock noise."""
@@ -123,7 +123,7 @@ class SyntheticSource:
         self.jammers = tuple(jammers)
         self._fused = [j for j in self.jammers if getattr(j, "fused", False)]
         self._added = [j for j in self.jammers if j not in self._fused]
-        self._tables = _jammer_tables(self._fused)
+        self._tables = jammer_tables(self._fused)
         steady = not any(j.spec.profile for j in self._fused)
         self._level = _levels(self._fused, 0, 1) if steady else None
         seed = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
@@ -333,13 +333,14 @@ def _levels(runs, first: int, last: int) -> np.ndarray:
     return np.stack(np.broadcast_arrays(*levels)) if levels else np.zeros((0, 1), np.float32)
 
 
-def _jammer_tables(runs) -> tuple[np.ndarray, ...]:
-    """JAMMER rows of the jammers, and the tables into which they point, flat: codes, waves, taps."""
+def jammer_tables(runs) -> tuple[np.ndarray, ...]:
+    """JAMMER rows of the jammers, and the tables into which they point, flat: codes, waves, taps; these after the
+    Gaussian numbers that bands of noise share."""
     rows = np.zeros(len(runs), JAMMER)
     parts: tuple[list, list, list] = (
         [np.zeros(0, np.int8)],
         [np.zeros(0, np.int16)],
-        [np.zeros(0, np.float32)],
+        [normals() if any(run.envelope.kind == NARROW for run in runs) else np.zeros(0, np.float32)],
     )
     for k, run in enumerate(runs):
         rows[k] = run.row[0]

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from sdr import iffile, scenario
+from signals import jammer_kernels
 from signals.clock import ClockSpec
 from signals.constants import F_L1_HZ
 from signals.frontend import FrontEndSpec
@@ -22,7 +23,7 @@ from signals.jammers import (
     _Jammer,
     finer,
 )
-from signals.modulation import code_lines, code_table
+from signals.modulation import BLOCK, code_lines, code_table
 from signals.multipath import Echo, Echoes
 from signals.sky import ScriptedSpec, SkySpec
 from signals.source import SyntheticSource, amplitude
@@ -219,6 +220,30 @@ def test_narrowband_is_flat_in_its_band(width_hz, center_hz):
     assert np.mean(np.abs(z) ** 4) / np.mean(np.abs(z) ** 2) ** 2 == pytest.approx(
         2.0, abs=Z * math.sqrt(20 / n_eff)
     )
+
+
+def test_lattice_of_the_noise_is_white_and_gaussian():
+    """Blocks draw on the same table, and still no two of them agree at any shift: |correlation|^2 of n points is exponential
+    of mean 1 / n. Power over m points: sqrt(1 / m); distribution: Kolmogorov and Smirnov's 1.95 at p = 1e-3."""
+    from scipy.stats import kstest
+
+    points = np.empty((2, 64 * BLOCK), np.float32)
+    for k in range(64):
+        part = np.empty((2, BLOCK), np.float32)
+        assert (
+            jammer_kernels._lattice(
+                part[0], part[1], k * BLOCK, BLOCK, jammer_kernels.normals(), np.uint64(5)
+            )
+            == 0
+        )
+        points[:, k * BLOCK : (k + 1) * BLOCK] = part
+    assert np.mean(points.astype(float) ** 2) == pytest.approx(0.5, rel=Z * math.sqrt(1 / points.size))
+    for one in points:
+        assert kstest(one * math.sqrt(2), "norm").statistic * math.sqrt(len(one)) < 1.95
+    blocks = np.fft.fft((points[0] + 1j * points[1]).reshape(64, BLOCK), 2 * BLOCK)
+    for shift in range(1, 64):
+        agreement = np.abs(np.fft.ifft(blocks * np.conj(np.roll(blocks, shift, 0)))) ** 2 / BLOCK
+        assert agreement.max() < math.log(63 * agreement.size / 1e-6)
 
 
 def test_matched_spectrum_is_sinc_squared_and_correlates_with_no_code():
