@@ -7,7 +7,6 @@ for 4 ms codes): each half has 2 R, so R = E[d^2] / 4, as long as the squaring l
 """
 
 import math
-from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
@@ -157,23 +156,38 @@ def follow(epochs, counts, slot, ring, done, last):
 
 
 @njit(cache=True, nogil=True)
-def window_variances(ring, done, last, own_bw, steered, scheme, decay, key, out):
-    """``window_variance`` of every row of ``ring`` (S, N) that is full and was heard since the last call into ``out`` (S,), else NaN.
+def loop_share(dll_bw_hz: float, integration_s: float, gain: float = 1.0) -> float:
+    """Variance of the replica's code phase over E[(e_{k+1} - e_k)^2] of successive discriminators e.
 
-    ``own_bw`` (S,) loop bandwidths where the integrations tell none. ``key`` (S, 3): what the loop's share depends on, C/N0 in
-    whole dB-Hz, samples and bandwidth (0 if ``steered``). Returns which keys are new.
+    First-order loop x' = x - a e, e = g x + n, a = 4 B T / (1 + 2 B T), g the discriminator's gain in noise: the range
+    carries x, E[x^2] = a / (g (2 - g a)) E[n^2], and E[d^2] = (g^2 a)^2 E[x^2] + ((1 + g a)^2 + 1) E[n^2]. Without a loop
+    (B = 0: steered from outside) the measurement is n / g itself.
     """
-    new = np.zeros(out.size, np.bool_)
+    if dll_bw_hz == 0.0:
+        return 0.5 / gain**2
+    bt = dll_bw_hz * integration_s
+    a = 4.0 * bt / (1.0 + 2.0 * bt)
+    x = a / (gain * (2.0 - gain * a))
+    return x / ((gain * gain * a) ** 2 * x + (1.0 + gain * a) ** 2 + 1.0)
+
+
+@njit(cache=True, nogil=True)
+def range_variances(ring, done, last, own_bw, tables, fs_hz, steered, scheme, decay, r0_m2, out):
+    """Range variances, m^2, of the rows of ``ring`` (S, N) that are full and were heard since the last call into ``out`` (S,), else NaN.
+
+    ``own_bw`` (S,) loop bandwidths where the integrations tell none; ``steered``: there is no loop. ``tables`` (S, ..): the
+    discriminators' (``nav.ultratight.discriminator_table``), whose first column is the gain in noise.
+    """
+    row = np.empty(4)
     for s in range(out.size):
         out[s] = math.nan
         if last[s, 5] > 0.0 and done[s] >= ring.shape[1]:
-            bw = 0.0 if steered else (last[s, 4] if last[s, 4] != 0.0 else own_bw[s])
-            cn0 = np.rint(last[s, 3])
-            new[s] = cn0 != key[s, 0] or last[s, 2] != key[s, 1] or bw != key[s, 2]
-            key[s, 0], key[s, 1], key[s, 2] = cn0, last[s, 2], bw
-            out[s] = window_variance(ring[s], done[s], scheme, decay)
+            t_s = last[s, 2] / fs_hz
+            bw_hz = 0.0 if steered else (last[s, 4] if last[s, 4] != 0.0 else own_bw[s])
+            look_up(tables[s], 10.0 ** (0.1 * np.rint(last[s, 3])) * t_s, row)
+            share = loop_share(bw_hz, t_s, row[0])
+            out[s] = window_variance(ring[s], done[s], scheme, decay) * METRES_PER_CHIP**2 * share + r0_m2
         last[s, 5] = -1.0
-    return new
 
 
 class DiscriminatorNoise:
@@ -187,8 +201,7 @@ class DiscriminatorNoise:
         self._channels: dict[tuple[str, int], int] = {}
         self._slot = np.zeros(0, np.int64)
         self._names: list[str] = []
-        self._spacing: list[float] = []
-        self._bw, self._share, self._key = np.zeros(0), np.zeros(0), np.zeros((0, 3))
+        self._loops = np.zeros(0), np.zeros((0, 2, 4))
         self._ring = np.zeros((0, spec.window))
         self._done, self._last = np.zeros(0, np.int64), np.zeros((0, 6))
 
@@ -207,47 +220,20 @@ class DiscriminatorNoise:
             if name not in self._names:
                 spec = loops.l1ca if signal == "L1CA" else loops.e1
                 self._names.append(name)
-                self._spacing.append(spec.early_late_space_chips)
-                self._bw = np.append(self._bw, spec.dll_bw_hz)
+                table = discriminator_table("L1CA" if signal == "L1CA" else "E1", spec.early_late_space_chips)
+                bw, tables = self._loops
+                self._loops = np.append(bw, spec.dll_bw_hz), np.array([*tables, table])
             self._slot[c] = self._names.index(name)
         more = len(self._names) - len(self._done)
         self._ring = np.pad(self._ring, ((0, more), (0, 0)))
-        self._done, self._share = np.pad(self._done, (0, more)), np.pad(self._share, (0, more))
-        self._key = np.pad(self._key, ((0, more), (0, 0)))
+        self._done = np.pad(self._done, (0, more))
         self._last = np.pad(self._last, ((0, more), (0, 0)), constant_values=-1.0)
 
     def estimate(self, steered: bool = False) -> dict[str, float]:
         """Variances, m^2, by satellite, of those heard since the last call; ``steered``: from outside."""
-        mean = np.empty(len(self._names))
-        how = SCHEMES[self.spec.scheme], self.spec.decay
-        new = window_variances(self._ring, self._done, self._last, self._bw, steered, *how, self._key, mean)
-        for s in np.flatnonzero(new):
-            cn0_dbhz, samples, bw_hz = self._key[s].tolist()
-            gain = code_gain(self._names[s][0], self._spacing[s], cn0_dbhz, samples / self.fs_hz)
-            self._share[s] = loop_share(bw_hz, samples / self.fs_hz, gain)
-        var = mean * METRES_PER_CHIP**2 * self._share + self.spec.r0_m2
+        var = np.empty(len(self._names))
+        range_variances(
+            self._ring, self._done, self._last, self._loops[0], self._loops[1], self.fs_hz, steered, SCHEMES[self.spec.scheme],
+            self.spec.decay, self.spec.r0_m2, var,
+        )  # fmt: skip
         return {n: v for n, v in zip(self._names, var.tolist()) if v == v}
-
-
-def loop_share(dll_bw_hz: float, integration_s: float, gain: float = 1.0) -> float:
-    """Variance of the replica's code phase over E[(e_{k+1} - e_k)^2] of successive discriminators e.
-
-    First-order loop x' = x - a e, e = g x + n, a = 4 B T / (1 + 2 B T), g the discriminator's gain in noise: the range
-    carries x, E[x^2] = a / (g (2 - g a)) E[n^2], and E[d^2] = (g^2 a)^2 E[x^2] + ((1 + g a)^2 + 1) E[n^2]. Without a loop
-    (B = 0: steered from outside) the measurement is n / g itself.
-    """
-    if dll_bw_hz == 0.0:
-        return 0.5 / gain**2
-    bt = dll_bw_hz * integration_s
-    a = 4.0 * bt / (1.0 + 2.0 * bt)
-    x = a / (gain * (2.0 - gain * a))
-    return x / ((gain * gain * a) ** 2 * x + (1.0 + gain * a) ** 2 + 1.0)
-
-
-@lru_cache(maxsize=512)
-def code_gain(signal: str, spacing_chips: float, cn0_dbhz: float, integration_s: float) -> float:
-    """Gain of the normalised code discriminator in noise (``nav.ultratight.discriminator_table``)."""
-    row = np.empty(4)
-    table = discriminator_table("L1CA" if signal == "G" else "E1", spacing_chips)
-    look_up(table, 10.0 ** (0.1 * cn0_dbhz) * integration_s, row)
-    return float(row[0])

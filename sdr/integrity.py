@@ -179,13 +179,15 @@ class IntegrityLive:
         if not known or snap is None:
             self.alarms["noise_rmd"].lack("no channel has filled its window of differences yet")
             return
-        mine = [i for i, n in enumerate(snap.names) if n in known]
-        names, own = [snap.names[i] for i in mine], snap.own_m2[mine]
+        names, own = snap.names, snap.own_m2
+        if not all(n in known for n in names):
+            own = own[[n in known for n in names]]
+            names = [n for n in names if n in known]
         var = np.array([known[n] for n in names]) / watch.fresh
-        now = self.response.variance(names, own)
-        if mine:
+        sigma, now = np.sqrt(var), self.response.variance(names, own)
+        if names:
             limit = noise_limit(self.spec.noise_rmd.window)
-            out["noise_rmd"] = found(names, sample, t_s, np.sqrt(var / now), limit, np.sqrt(var))
+            out["noise_rmd"] = found(names, sample, t_s, np.sqrt(var / now), limit, sigma)
         if self.response.spec.noise == "noise_rmd":
             self.response.scale = {n: v / o for n, v, o in zip(names, var, own) if v > 0}
 
