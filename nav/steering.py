@@ -367,9 +367,9 @@ class Steering:
     # -- one epoch ----------------------------------------------------------------------------------------------
 
     def advance(self, sample: int, epochs, counts, channels_state, ephemerides) -> np.ndarray:
-        """Predict to ``sample``, update from the epochs of the slab that ends there, command the next one.
+        """Predict to ``sample``, update from the epochs since the last call, command what follows.
 
-        ``epochs``, ``counts``: of ``Tracker.process``; ``channels_state`` (C,) STATE_* of the tracker's channels;
+        ``epochs``, ``counts``: of ``Tracker.process``, which has come to ``sample``; ``channels_state`` (C,) STATE_* of the tracker's channels;
         ``ephemerides``: called once a second for the newest EPHEMERIS rows. Returns AIDING (C,).
         """
         if kernels.any_unlocked(self.active, self.slot, np.ascontiguousarray(channels_state)):
@@ -394,7 +394,7 @@ class Steering:
         log, delay = f.slot(sample / self.fs_hz), self.delay + self.bias
         nis, rows, surprise = kernels.navigation_epoch(
             f.code, f.x, f.p, sensors, dt_s, 1.0 / self.spec.update_hz, f.epochs, self.spec.block, f.filter_s, f.rates, f.q, self.spec.limit_sigma, self.spec.fast_cn0_s,
-            self.spec.slow_cn0_s, self.spec.code_floor_m, self.spec.rate_floor_mps, sample, self.fs_hz, ms, frac_s, tow,
+            self.spec.slow_cn0_s, self.spec.code_floor_m, self.spec.rate_floor_mps, self.sample, sample, self.fs_hz, ms, frac_s, tow,
             tow_frac, self.orbit, self.toe_toc_tgd, self.active, self.slot, self.second, self.period_s,
             delay, self.delay_rate, self.inflate, self._tables, self.which, epochs, counts, f.power, f.cn0,
             f.rho, f.rate, f.accel, f.los, f.f, log.phi, log.qd, log.h, log.r, log.var, f.own, log.used, log.k, log.s, log.p, f.dx,

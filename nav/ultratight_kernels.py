@@ -559,9 +559,10 @@ def pseudoranges(model, x, active, second, sat_pos, sat_vel, sat_acc, clock, clo
 
 
 @njit(cache=True, nogil=True)
-def read_epochs(epochs, counts, slot, active, period_s, sample, fs_hz, rx_frac_s, rx_ms, rho, rate, accel, tables, which,
+def read_epochs(epochs, counts, slot, active, period_s, before, sample, fs_hz, rx_frac_s, rx_ms, rho, rate, accel, tables, which,
                 power, fast_s, slow_s, code_m, rate_mps, off_m, off_mps, span_s, seen):  # fmt: skip
-    """Means over each channel's integrations of this epoch: discriminators, and the NCO's offset from the prediction.
+    """Means over each channel's integrations of this epoch, those that ended after sample ``before``: discriminators, and the
+    NCO's offset from the prediction.
 
     code_m, rate_mps : measured minus NCO;  off_m, off_mps : NCO minus predicted, both at mid-integration
     ``rx_ms``, ``rx_frac_s``: receiver time at ``sample``; whole code periods of the NCO are those nearest to it.
@@ -575,7 +576,7 @@ def read_epochs(epochs, counts, slot, active, period_s, sample, fs_hz, rx_frac_s
         length = period_s[c] * CHIP_RATE_HZ
         for j in range(counts[k]):
             e = epochs[k, j]
-            if e.state != STATE_LOCKED:
+            if e.state != STATE_LOCKED or np.int64(e.sample_index) + e.n_samples <= before:
                 continue
             T = e.n_samples / fs_hz
             dt = (np.int64(e.sample_index) - sample) / fs_hz + 0.5 * T
@@ -692,12 +693,12 @@ def steer(active, slot, period_s, sample, rx_ms, rx_frac_s, rho, rate, accel, ev
 
 @njit(cache=True, nogil=True)
 def navigation_epoch(model, x, p, sensors, dt_s, every_s, epoch, block, filter_s, rates, q_diag, limit, fast_s, slow_s, floor_m, floor_mps,
-                     sample, fs_hz, rx_ms, rx_frac_s, tow_whole, tow_frac, orbit, toe_toc_tgd, active, slot, second,
+                     before, sample, fs_hz, rx_ms, rx_frac_s, tow_whole, tow_frac, orbit, toe_toc_tgd, active, slot, second,
                      period_s, delay, delay_rate, inflate, tables, which, epochs, counts, power, cn0, rho, rate, accel,
                      los, f, phi, qd, h, z, var, own, used, k, s, p_prior, dx, commands):  # fmt: skip
     """Predict, update from every channel's discriminators and steer: one call per navigation epoch.
 
-    The epoch ends at receiver ``sample``; commands hold from there on. ``inflate`` (2C,) multiplies the variances of ranges
+    The epoch leads from receiver sample ``before`` to ``sample``; commands hold from there on. ``inflate`` (2C,) multiplies the variances of ranges
     and rates, ``own`` (2C,) receives them without it, 0 where nothing was heard. Returns (NIS, rows that weigh something, mean over
     the rows taken of their normalised innovations squared, none above ``SURPRISE``).
     """
@@ -716,8 +717,8 @@ def navigation_epoch(model, x, p, sensors, dt_s, every_s, epoch, block, filter_s
         model, x, active, second, sat_pos, sat_vel, sat_acc, clock, clock_rate, delay, delay_rate, rho, rate, accel, los
     )  # fmt: skip
     read_epochs(
-        epochs, counts, slot, active, period_s, sample, fs_hz, rx_frac_s, rx_ms, rho, rate, accel, tables, which, power,
-        fast_s, slow_s, code_m, rate_mps, off_m, off_mps, span_s, seen,
+        epochs, counts, slot, active, period_s, before, sample, fs_hz, rx_frac_s, rx_ms, rho, rate, accel, tables, which,
+        power, fast_s, slow_s, code_m, rate_mps, off_m, off_mps, span_s, seen,
     )  # fmt: skip
     cn0_from_powers(power, active, span_s, cn0)
     h[:] = 0.0

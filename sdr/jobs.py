@@ -307,8 +307,8 @@ def _store_outcome(store: Store, receiver: Receiver, outcome: Outcome, tally: _T
             tally.levels.append(part["protection"])
     for rows in outcome.observations:
         store.append("navigation/observations", rows)
-    if outcome.steering is not None:
-        store.append("navigation/steering", outcome.steering)
+    if outcome.steering:
+        store.append("navigation/steering", np.concatenate(outcome.steering))
     for rows in outcome.views:
         store.append("navigation/satellites", rows)
     for row in outcome.solutions:

@@ -8,6 +8,7 @@ start time and no almanac enters: everything known of the sky was decoded from t
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import count
 from typing import Any, Protocol
 
@@ -64,7 +65,7 @@ class Outcome:
     n_end: int
     found: np.ndarray
     """ACQUISITION rows of satellites that a channel was started for."""
-    epochs: list[tuple[int, np.ndarray, np.ndarray]]
+    epochs: list[tuple[int, np.ndarray, np.ndarray]] = field(default_factory=list)
     """(channel, EPOCH rows, corr (n, K)) of every channel that finished integrations."""
     observations: list[np.ndarray] = field(default_factory=list)
     solutions: list[np.ndarray] = field(default_factory=list)
@@ -74,8 +75,8 @@ class Outcome:
     """(monitor, MONITOR rows) of what the monitors made of the correlator outputs."""
     integrity: list[dict[str, np.ndarray]] = field(default_factory=list)
     """Rows of the integrity monitors by dataset name, one item per navigation epoch."""
-    steering: np.ndarray | None = None
-    """STEERING row where a filter steers the channels."""
+    steering: list[np.ndarray] = field(default_factory=list)
+    """STEERING rows, one per update of the filter that steers the channels."""
 
 
 class Receiver:
@@ -115,10 +116,7 @@ class Receiver:
     def __iter__(self) -> Iterator[Outcome]:
         # The first slab is what one search takes; after it, slabs divide the time between positions.
         period_s = 1.0 / self.spec.navigation.rate_hz
-        longest_s = self.spec.slab_ms * 1e-3
-        if self.steering is not None:
-            longest_s = 1.0 / self.spec.steering.update_hz
-        per_period = math.ceil(period_s / longest_s - 1e-9)
+        per_period = math.ceil(period_s / (self.spec.slab_ms * 1e-3) - 1e-9)
         ends = (round(k * period_s / per_period * self.fs_hz) for k in count(1))
         for k, end in enumerate(ends, 1):
             if self.position == 0 and self._wanted < end:
@@ -137,22 +135,23 @@ class Receiver:
     def _advance(self, n0: int, iq: np.ndarray, navigate: bool) -> Outcome:
         n_end = n0 + iq.shape[1]
         # Searching comes first: a new channel starts with this slab, so that nothing of a short file is lost.
-        found = self._search(n0, iq)
-        epochs, counts, corr = self.tracker.process(n0, iq, self._commands())
+        out = Outcome(n0, n_end, self._search(n0, iq))
+        stops = self._updates(n0, n_end)
+        epochs, counts, corr = self.tracker.process(
+            n0, iq, self._commands(n0), [s for s in stops if s < n_end], partial(self._steer, out)
+        )
         self.telemetry.hear()
         self._undecoded += 1
         if navigate or self._undecoded >= DECODE_EVERY or n_end >= self.source.n_samples:
             self._decode()
         self.position = n_end
-        rows = [(c, epochs[c, :n], corr[c, :n]) for c, n in enumerate(counts) if n]
-        for c, mine, _ in rows:
-            if len(mine) > 1:
-                self.drift.hear(self.tracker.channels["signal"][c].decode(), mine)
-        out = Outcome(n0, n_end, found, rows)
+        out.epochs = rows = [(c, epochs[c, :n], corr[c, :n]) for c, n in enumerate(counts) if n]
+        for c, mine, _ in () if stops else rows:
+            self.drift.hear(self.tracker.channels["signal"][c].decode(), mine)
         if self.integrity is not None:
             self.integrity.hear(self.channel_of, epochs, counts, self.spec.tracking)
-        if self._steered:
-            self._steer(n_end, epochs, counts, out)
+        if n_end in stops:
+            self._steer(out, n_end, epochs, counts)
         if navigate:
             self._navigate(n_end, out)
             self._hand_over(n_end, out)
@@ -350,8 +349,8 @@ class Receiver:
         mask_rad = math.radians(self.spec.navigation.elevation_mask_deg)
         return Steering(spec, self.fs_hz, sensors, spacing, mask_rad)
 
-    def _commands(self) -> np.ndarray | None:
-        """AIDING of the slab that begins: what navigation left at the last one's end, for new channels nothing."""
+    def _commands(self, sample: int) -> np.ndarray | None:
+        """AIDING from ``sample`` on: what navigation left at the last update, for new channels nothing."""
         heeds = self._adapts and (not self.spec.respond.off or bool(self.flags.names))
         if not heeds and (self._aiding is None or len(self._aiding) == len(self.tracker.channels)):
             return self._aiding
@@ -359,12 +358,12 @@ class Receiver:
         if self._aiding is not None:
             commands[: len(self._aiding)] = self._aiding
         if heeds:
-            self._weaken(commands)
+            self._weaken(commands, sample)
         return commands
 
-    def _weaken(self, commands: np.ndarray) -> None:
+    def _weaken(self, commands: np.ndarray, sample: int) -> None:
         """Tell the loops whose bandwidths follow the noise what the monitors ask for."""
-        remedy, snap = self._remedy(self.position), self.navigator.snapshot
+        remedy, snap = self._remedy(sample), self.navigator.snapshot
         own = {} if snap is None else dict(zip(snap.names, snap.own_m2))
         for row in () if remedy is None else remedy.rows:
             system, prn = row["system"].decode(), int(row["prn"])
@@ -373,25 +372,36 @@ class Receiver:
                 noisier = row["variance_m2"] / own_m2
                 commands["weaken"][c] = max(row["weaken"], 1.0) * (noisier if noisier > 1.0 else 1.0)
 
-    def _steer(self, sample: int, epochs: np.ndarray, counts: np.ndarray, out: Outcome) -> None:
+    def _updates(self, n0: int, n_end: int) -> list[int]:
+        """Samples in (n0, n_end] at which the filter updates and commands anew; they divide the time between positions."""
+        if not self._steered:
+            return []
+        rate_hz, update_hz = self.spec.navigation.rate_hz, self.spec.steering.update_hz
+        step_s = 1.0 / rate_hz / round(update_hz / rate_hz)
+        first, last = (math.floor(n / (step_s * self.fs_hz)) for n in (n0, n_end))
+        ends = (round(k * step_s * self.fs_hz) for k in range(first, last + 2))
+        return [s for s in ends if n0 < s <= n_end]
+
+    def _steer(self, out: Outcome, sample: int, epochs: np.ndarray, counts: np.ndarray) -> np.ndarray | None:
+        """One update of the filter -> AIDING from ``sample`` on; None once it has let go."""
         steering = self.steering
-        assert steering is not None
+        if steering is None or steering.filter is None:
+            return None
         if not self.spec.respond.off or self.flags.names:
             watched = None if self.integrity is None else self.integrity.steered
             steering.heed(self._remedy(sample), {} if watched is None else watched.own_m2())
         self._aiding = steering.advance(
             sample, epochs, counts, self.tracker.channels["state"], self.telemetry.ephemerides
         )
-        out.steering = steering.record.copy()
+        out.steering.append(steering.record.copy())
         if self.integrity is not None:
             self.integrity.gather(steering)
-        if steering.filter is None:
-            return
-        if self._week is not None and steering.due(SOLUTION_S):
+        if self._steered and self._week is not None and steering.due(SOLUTION_S):
             out.solutions.append(steering.solution(self._week))
-        if steering.due(TAKE_S):
+        if self._steered and steering.due(TAKE_S):
             steering.meet(self.navigator.handover()[2])
-            steering.take(self._phase_locked(), self.telemetry.ephemerides())
+            steering.take(self._phase_locked(sample), self.telemetry.ephemerides())
+        return self._commands(sample)
 
     def _hand_over(self, sample: int, out: Outcome) -> None:
         """Let the filter take the channels over from a scalar fix."""
@@ -404,12 +414,12 @@ class Receiver:
             self.navigator.spec.tropo != "none",
         )
         self.steering.try_start(
-            sample, row, self.navigator, self._phase_locked(), self.telemetry.ephemerides(), klobuchar
+            sample, row, self.navigator, self._phase_locked(sample), self.telemetry.ephemerides(), klobuchar
         )
         self._aiding = None
 
-    def _phase_locked(self) -> list[tuple[int, str, int, float]]:
-        replica = self.tracker.snapshot(self.position)
+    def _phase_locked(self, sample: int) -> list[tuple[int, str, int, float]]:
+        replica = self.tracker.snapshot(sample)
         rows = []
         for (signal, prn), c in self.channel_of.items():
             if (

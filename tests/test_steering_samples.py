@@ -17,23 +17,36 @@ OUTAGE_S = (26.0, 34.0)
 SPACING = {"L1CA": 0.5, "E1": 0.25}
 
 
-def _outcomes(spec, mode, sensors):
-    receiver = spec.receiver.model_copy(update={"steering": spec.receiver.steering.with_mode(mode)})
+def _outcomes(spec, mode, sensors, **changes):
+    update = {"steering": spec.receiver.steering.with_mode(mode), **changes}
+    receiver = spec.receiver.model_copy(update=update)
     source = scenario.source(spec)
     return source, list(Receiver(receiver, source, sensors))
 
 
-@pytest.fixture(scope="module")
-def outage():
+def _outage(**changes):
     spec = scenario.load("drive-jam", ["duration_s=37.0"])[0]
     fault = PowerDrop(start_s=OUTAGE_S[0], stop_s=OUTAGE_S[1], drop_db=100.0)
     spec = spec.model_copy(update={"jammer": (), "fault": (fault,)})
-    return _outcomes(spec, "ultra_tight", scenario.sensors(spec))
+    return _outcomes(spec, "ultra_tight", scenario.sensors(spec), **changes)
+
+
+@pytest.fixture(scope="module")
+def outage():
+    return _outage()
+
+
+def test_updates_within_a_slab_give_the_bits_of_a_slab_for_each(outage):
+    results = []
+    for _, outcomes in (outage, _outage(slab_ms=20)):
+        parts = ([row for o in outcomes for row in getattr(o, kind)] for kind in ("steering", "solutions"))
+        results.append([np.concatenate(rows).tobytes() for rows in parts])
+    assert results[0] == results[1]
 
 
 def test_outage_is_bridged_and_every_satellite_is_back_within_a_second(outage):
     source, outcomes = outage
-    rows = np.concatenate([o.steering for o in outcomes if o.steering is not None])
+    rows = np.concatenate([row for o in outcomes for row in o.steering])
     t = rows["t_s"]
     before = rows[(t > OUTAGE_S[0] - 1) & (t < OUTAGE_S[0])]
     n = before["n_steered"].max()
@@ -142,8 +155,8 @@ def test_two_systems_are_back_at_once_after_thirty_dark_seconds():
     dark = spec.fault[0].start_s, spec.fault[0].stop_s
     assert dark[1] - dark[0] == 30.0
     source, outcomes = _outcomes(spec, "ultra_tight", scenario.sensors(spec))
-    rows = np.concatenate([o.steering for o in outcomes if o.steering is not None])
-    fixes = np.concatenate([s for o in outcomes if o.steering is not None for s in o.solutions])
+    rows = np.concatenate([row for o in outcomes for row in o.steering])
+    fixes = np.concatenate([s for o in outcomes if o.steering for s in o.solutions])
     fixes = fixes[fixes["t_s"] > rows["t_s"][0]]
     error = np.linalg.norm(fixes["pos_ecef_m"] - source.sky.receiver(fixes["t_s"])["pos_ecef_m"], axis=1)
     claimed = np.sqrt(np.trace(fixes["cov_ecef_m2"], axis1=1, axis2=2))

@@ -490,6 +490,38 @@ def test_steered_nco_follows_the_command():
     assert np.all(e["doppler_rate_hz_s"] == 500.0)
 
 
+@pytest.mark.parametrize("threads", [1, 2])
+def test_commands_at_stops_give_the_bits_of_slabs_cut_there(threads):
+    """Also where a stop falls into the seam of two slabs, 2.01 of the longest code periods long."""
+    sats = [Satellite("L1CA", 17, FS, doppler_hz=400.0), Satellite("E1C", 6, FS, doppler_hz=-900.0, seed=2)]
+    sizes = [81920, 5000, 9001, 70000, 40000, 81920, 20000, 81921, 3000, 81920]
+    cuts = np.concatenate([[0], np.cumsum(sizes)])
+    iq = slab(sats, 50.0, 0, int(cuts[-1]), np.random.default_rng(4))
+
+    def command(sample):
+        rows = np.zeros(2, AIDING)
+        rows["sample_index"], rows["steered"] = sample, 1
+        rows["code_phase_chips"] = [s.code_phase(sample) + 1e-8 * sample for s in sats]
+        rows["doppler_hz"] = [s.doppler(sample) for s in sats]
+        rows["doppler_rate_hz_s"] = 20.0, -1e-4 * sample
+        return rows
+
+    def run(ends):
+        tracker, out = TrackingSpec(threads=threads).start(FS), [b""] * 4
+        for s in sats:
+            tracker.add(s.acquisition(0, 20.0, 0.1))
+        for n0, end in pairwise(ends):
+            stops = [int(c) for c in cuts if n0 < c < end]
+            e, n, z = tracker.process(n0, iq[:, n0:end], command(n0), stops, lambda stop, e, n: command(stop))
+            rows = [x[c, : n[c]].tobytes() for x in (e, z) for c in range(2)]
+            out = [a + b for a, b in zip(out, rows)]
+        return *out, [tracker.channels[name].tobytes() for name in tracker.channels.dtype.names]
+
+    cut = run(cuts.tolist())
+    assert cut == run(cuts[[0, 1, -1]].tolist())
+    assert cut == run(cuts[::5].tolist())
+
+
 def test_snapshot_is_the_replica_at_one_sample():
     sats = [
         Satellite("L1CA", 5, FS, doppler_hz=2000.0, code_chips=5.0),

@@ -205,8 +205,8 @@ def test_nco_state_is_the_point_of_linearisation(period_s):
     out = [np.zeros(1) for _ in range(5)]
     seen = np.zeros(1, np.int64)
     kernels.read_epochs(
-        e, np.ones(1, np.int64), np.zeros(1, np.int64), np.ones(1, np.bool_), np.array([period_s]), sample, fs_hz, rx_frac_s,
-        rx_ms, rho, rate, accel, np.zeros((1, 1, 4)), np.zeros(1, np.int64), np.zeros((1, kernels.N_CN0)), 0.1, 1.0, *out, seen,
+        e, np.ones(1, np.int64), np.zeros(1, np.int64), np.ones(1, np.bool_), np.array([period_s]), sample - 80_000, sample,
+        fs_hz, rx_frac_s, rx_ms, rho, rate, accel, np.zeros((1, 1, 4)), np.zeros(1, np.int64), np.zeros((1, kernels.N_CN0)), 0.1, 1.0, *out, seen,
     )  # fmt: skip
     code_m, rate_mps, off_m, off_mps, span_s = (float(a[0]) for a in out)
     assert (code_m, rate_mps) == pytest.approx((5.0, 0.1), rel=1e-6)

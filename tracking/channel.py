@@ -2,6 +2,7 @@
 
 import math
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -472,7 +473,7 @@ class Tracker:
         )  # fmt: skip
 
     # ------------------------------------------------------------------------------------------------ run
-    def process(self, n0, iq, aiding=None):
+    def process(self, n0, iq, aiding=None, stops=(), steer=None):
         """Track one slab.
 
         Parameters
@@ -482,6 +483,9 @@ class Tracker:
         iq : int8 | int16 | float32 (2, n)
         aiding : AIDING (C,), optional
             Steering, one row per channel; it stays in force until replaced. None: nothing new.
+        stops : int, ascending
+            Samples within the slab at which ``steer(stop, epochs, counts)`` may replace it: all channels have come to the
+            stop and no further, their integrations so far are in ``epochs`` and ``counts``.
 
         Returns
         -------
@@ -492,12 +496,7 @@ class Tracker:
             Correlator outputs of those integrations at ``taps_chips(c)``; unused columns are zero.
         """
         self._check(int(n0), iq)
-        if aiding is not None:
-            if len(aiding) != len(self.channels):
-                raise ValueError(
-                    f"aiding has {len(aiding)} rows for {len(self.channels)} channels: give one each"
-                )
-            self._commands[:] = aiding
+        self._command(aiding)
         # What was left over grows by the first code periods of the slab: no channel needs to cross the seam after them.
         tail = np.concatenate([self._tail, iq[:, : self._head_samples()]], axis=1)
         first, n_left = self._end - self._tail.shape[1], self._tail.shape[1]
@@ -509,19 +508,35 @@ class Tracker:
         self.symbols = np.zeros((n_channels, n_max + HISTORY // 4), SYMBOL)
         integer = int(HAS_INTEGER_PATH and iq.dtype == np.int8 and self.spec.arithmetic == "auto")
 
-        def run(which):
+        def run(which, since, stop):
             for begin, samples in ((first, tail), (first + n_left, iq)):
+                if since >= begin + samples.shape[1]:
+                    continue  # every channel is beyond the seam
+                xi, xq = samples[:, : stop - begin]
                 track_slab(
-                    which, integer, samples[0], samples[1], begin, self.fs_hz, self.if_hz, self._pool, self._tap_q,
-                    self._secondary, self.channels, self._acc, self._hist, self._commands, epochs, counts, corr,
-                    self.symbols, self.symbol_counts,
+                    which, integer, xi, xq, begin, self.fs_hz, self.if_hz, self._pool, self._tap_q, self._secondary,
+                    self.channels, self._acc, self._hist, self._commands, epochs, counts, corr, self.symbols,
+                    self.symbol_counts,
                 )  # fmt: skip
 
         active = self._running()[0]
-        if len(active):
-            self._share(run, active)
+        for since, stop in pairwise([first, *stops, self._end]):
+            if len(active):
+                self._share(run, active, since, stop)
+            if stop < self._end:
+                self._command(steer(stop, epochs, counts))
         self._keep(tail[:, :n_left], iq)
         return epochs, counts, corr
+
+    def _command(self, aiding):
+        """Put AIDING rows in force, if there are any."""
+        if aiding is None:
+            return
+        if len(aiding) != len(self.channels):
+            raise ValueError(
+                f"aiding has {len(aiding)} rows for {len(self.channels)} channels: give one each"
+            )
+        self._commands[:] = aiding
 
     def _check(self, n0, iq):
         """Raise ValueError unless the slab continues the samples before it."""
@@ -553,14 +568,14 @@ class Tracker:
         count, oldest = survey(self.channels, which)
         return which[:count], oldest if count else self._end
 
-    def _share(self, run, active):
-        """Run the channels, each on one thread."""
+    def _share(self, run, active, since, stop):
+        """Run the channels from one sample to another, each on one thread."""
         n = min(self.spec.threads, len(active))
         if self._threads is None or n < 2:
-            run(active)
+            run(active, since, stop)
             return
-        others = [self._threads.submit(run, active[t::n]) for t in range(1, n)]
-        run(active[::n])
+        others = [self._threads.submit(run, active[t::n], since, stop) for t in range(1, n)]
+        run(active[::n], since, stop)
         for other in others:
             other.result()
 
