@@ -343,3 +343,6 @@ def _window(window_s, integration_s, least):
             f"window_s = {window_s:g} holds {n} integrations of {integration_s:g} s, at least {least} are needed"
         )
     return n
+
+
+DETECTORS = (Cn0Drop, NoiseFloor, SignalQuality, AgcGain, AdcHistogram)

@@ -222,3 +222,6 @@ class FftRun:
         epochs = self.epoch + np.arange(len(value))
         self.epoch += len(value)
         return statistics((value - self.mean) / self.std, epochs, self.integration_s, hz, sample_index)
+
+
+DETECTORS = (FftMonitor,)

@@ -324,3 +324,6 @@ def _whitener(R, filtered):
             "the noise of these taps is linearly dependent: use a wider tap spacing for the GLRT"
         ) from None
     return np.linalg.inv(root), root
+
+
+DETECTORS = (GlrtMonitor,)

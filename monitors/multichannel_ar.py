@@ -279,3 +279,6 @@ class MultichannelArRun:
         stop = ends + len(past) + 1
         start = stop - self.window
         return np.log((total[stop] - total[start]) / (whole[stop] - whole[start]))
+
+
+DETECTORS = (MultichannelAr,)

@@ -4,17 +4,20 @@ Where a range was found with a million epochs, the short run's own sampling erro
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 
-from monitors.batch import simulate_points, sum_dumps, train_monitors, trial_seed
+from monitors.batch import line_offset_hz, start_monitors, sum_dumps, trial_seed
 from monitors.detection import p_md_curve
 from monitors.fft import FftMonitor
 from monitors.glrt import GlrtMonitor
 from monitors.threshold import AnalyticNull, EmpiricalNull, GaussianNull, ParetoNull, real_p_fa
+from signals.constants import METRES_PER_CHIP, WAVELENGTH_M
 from signals.multipath import Aeronautical
 from tracking.correlator_model import Twin, TwinCW, noise_sigma
+from tracking.twin_kernels import hatch_smooth
 
 Z = 5.0
 P_FA = 1.6e-5
@@ -31,6 +34,49 @@ GAL = Twin(
 )
 MONITORS = {"C": FftMonitor(), "I": FftMonitor(input="I"), "G": GlrtMonitor()}
 TRAIN, THRESHOLD, TEST = 1, 2, 3
+SETTLE = 500
+
+
+class TrialResult(NamedTuple):
+    """``statistics`` {monitor name: STATISTIC}; ``df_hz``: offset of the first CW from its nearest code line."""
+
+    statistics: dict
+    smoothed_error_m: np.ndarray
+    df_hz: np.ndarray
+
+
+def train_monitors(spec, monitors, root, n_trials, n_epochs, dumps=1):
+    """{name: Run} trained on ``n_trials`` realisations of the channel without its jammers."""
+    quiet = spec.model_copy(update={"jammers": ()})
+    runs = start_monitors(quiet, monitors, dumps)
+    for trial in range(n_trials):
+        twin = quiet.start(trial_seed(root, 0, trial))
+        twin(SETTLE)
+        corr = sum_dumps(twin(n_epochs)[1], dumps)
+        for run in runs.values():
+            run.train(corr)
+    return runs
+
+
+def simulate_trial(spec, runs, root, point, trial, n_epochs, dumps):
+    """One trial of trained monitors, whose training is kept; the 100-s smoothing filter is long in use."""
+    twin = spec.start(trial_seed(root, point, trial))
+    twin(SETTLE)
+    epochs, corr = twin(n_epochs)
+    summed = sum_dumps(corr, dumps)
+    statistics = {name: run.fresh()(summed) for name, run in runs.items()}
+    code_m = epochs["code_error_chips"] * METRES_PER_CHIP
+    smoothed = np.empty(len(code_m))
+    n_smooth = round(100.0 / spec.integration_s)
+    hatch_smooth(code_m, epochs["phase_error_cycles"] * WAVELENGTH_M, n_smooth, n_smooth, smoothed)
+    return TrialResult(statistics, smoothed, line_offset_hz(spec, epochs["t_s"]))
+
+
+def simulate_points(points, runs, root, n_trials, n_epochs, dumps=1, first_trial=0):
+    """All trials of a list of twins, in order."""
+    for point, spec in enumerate(points):
+        for trial in range(first_trial, first_trial + n_trials):
+            yield simulate_trial(spec, runs, root, point, trial, n_epochs, dumps)
 
 
 def closed_loop_maxima(spec, n_trials, n_epochs, seed):

@@ -8,13 +8,13 @@ silence. ``sdr.watch.null`` says where the thresholds come from, ``sdr.watch.fro
 
 import math
 from itertools import pairwise
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Union
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from monitors.baselines import AdcHistogram, AgcGain, Cn0Drop, NoiseFloor, SignalQuality
-from monitors.fft import FftMonitor
+from monitors import detectors
+from monitors.baselines import AdcHistogram, AgcGain
 from monitors.glrt import GlrtMonitor
 from monitors.multichannel_ar import MultichannelAr
 from nav.navlog import REMEDY, Remedy
@@ -24,10 +24,10 @@ from sdr.watch.post import MONITOR, Post, joined
 from signals.multipath import MultipathSpec
 from tracking.channel import STATE_LOCKED
 
-Detector = Annotated[
-    FftMonitor | GlrtMonitor | MultichannelAr | Cn0Drop | NoiseFloor | SignalQuality | AgcGain | AdcHistogram,
-    Field(discriminator="kind"),
-]
+if TYPE_CHECKING:
+    Detector = Any
+else:
+    Detector = Annotated[Union[detectors()], Field(discriminator="kind")]  # noqa: UP007
 EPOCH_S = {"L1CA": 0.02, "E1B": 0.1, "E1C": 0.1}
 """Length of a monitor's epoch; the AR model needs more vectors than 100 ms give and takes 20 ms of E1 too."""
 RESETTLE_S = 0.5

@@ -1,7 +1,7 @@
 """Thresholds of the live monitors: null models of statistics that a training of seconds has standardised.
 
-A P_FA of 1e-5 needs a million quiet epochs, a channel has twenty quiet seconds. The GLRT's null is analytic. For the
-FFT and the AR monitor, and for every other one on the channels that is told which echoes to expect, the twin
+A P_FA of 1e-5 needs a million quiet epochs, a channel has twenty quiet seconds. The GLRT's null is analytic. For
+monitors without ``values`` (FFT, AR), and for every other one on the channels that is told which echoes to expect, the twin
 *rehearses*: it lives through the same training many times over, each time with another satellite, at the channel's own
 C/N0 and under those echoes; what it shows afterwards, the errors of a short training included, is the null. Its seeds
 are no scenario's. Without echoes the others take the tail that theory gives to the few windows of their training:
@@ -22,7 +22,6 @@ from typing import Any
 import numpy as np
 
 from monitors.baselines import Cn0Drop, NoiseFloor, SignalQuality
-from monitors.fft import FftMonitor
 from monitors.glrt import GlrtMonitor
 from monitors.multichannel_ar import MultichannelAr
 from monitors.short_training import StudentNull
@@ -56,7 +55,7 @@ def null_of(channel: Any, corr: np.ndarray) -> Any:
     if isinstance(detector, GlrtMonitor):
         bins = _effective_bins(detector, tuple(channel.taps), channel.epoch_s, channel.signal, channel.prn)
         return GlrtNull(channel.run, bins, rise)
-    if channel.spec.expect_multipath is not None or isinstance(detector, FftMonitor | MultichannelAr):
+    if channel.spec.expect_multipath is not None or not hasattr(channel.run, "values"):
         return _rehearsed(channel, len(corr))
     if isinstance(detector, SignalQuality):
         return StudentNull.fit(channel.run.values(corr), two_sided=True)
