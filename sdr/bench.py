@@ -454,7 +454,6 @@ def _steered(rounds: int) -> tuple[float, float]:
     sky = [
         "jammer=[]",
         "sky.start=2024-03-01T10:00:58",
-        "sky.start=2024-03-01T10:00:58",
         "sky.max_satellites=10",
         "sky.elevation_mask_deg=5",
         f"duration_s={STEERED_FROM_S + STEERED_S}",
