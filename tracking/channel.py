@@ -11,7 +11,13 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 from signals.codes import secondary_code
 from signals.constants import CHIP_RATE_HZ, F_L1_HZ
 from signals.modulation import BLOCK, SIGNALS, autocorrelation, chip_acf, code_table, sampled_band_hz
-from tracking.discriminators import CARRIER_DISCRIMINATORS, CODE_DISCRIMINATORS, code_scale_chips
+from tracking.discriminators import (
+    CARRIER_DISCRIMINATORS,
+    CODE_DISCRIMINATORS,
+    CodeDiscriminator,
+    CostasDiscriminator,
+    code_scale_chips,
+)
 from tracking.kernels import CHANNEL, HISTORY, KIND_CA, KIND_DATA, KIND_PILOT, SYMBOL, survey, track_slab
 from tracking.lock import STATE_BIT_SYNC, STATE_IDLE, STATE_LOCKED, STATE_LOST, STATE_PULL_IN
 from tracking.loops import MAX_BT, adapted_gains, dll_gains, fll_gain, pll_gains
@@ -94,9 +100,7 @@ class _Loops(BaseModel):
     """Noise bandwidth of the code loop, one-sided."""
     fll_bw_hz: float = Field(0.0, ge=0.0, le=50.0)
     """Noise bandwidth of the frequency aid; 0: none."""
-    code_discriminator: Literal["envelope", "power", "dot_product", "coherent", "very_early_late"] = (
-        "envelope"
-    )
+    code_discriminator: CodeDiscriminator = "envelope"
     """Code discriminator."""
     taps: TapsSpec | None = None
     """Window of additional correlator taps; unset: E, P, L alone."""
@@ -128,7 +132,7 @@ class L1caTracking(_Loops):
     """Coherent integration after bit synchronisation."""
     early_late_space_chips: float = Field(0.5, gt=0.0, lt=2.0)
     """Whole spacing between early and late."""
-    carrier_discriminator: Literal["costas_atan", "costas_product"] = "costas_atan"
+    carrier_discriminator: CostasDiscriminator = "costas_atan"
     """Phase discriminator, insensitive to data."""
 
     @model_validator(mode="after")
