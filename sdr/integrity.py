@@ -139,7 +139,7 @@ class IntegrityLive:
             self._ranges(snap, sample, t_s, out)
         filter_monitors = self._monitors_of(watch)
         dx, p = filter_monitors(watch, sample, t_s, out)
-        self._name_rivals(out.get("parallel_filters"))
+        self._name_rivals(out.get("parallel_filters"), t_s)
         self._noise_rows(watch, snap, sample, t_s, out)
         for name in MONITORS:
             if name in out:
@@ -163,13 +163,16 @@ class IntegrityLive:
             self._filter = watch, FilterMonitors(self.spec, self.response, self.alarms, watch.slots)
         return self._filter[1]
 
-    def _name_rivals(self, rows: np.ndarray | None) -> None:
-        """Beside whom the parallel filters accuse, those that the ranges do not tell from it."""
+    def _name_rivals(self, rows: np.ndarray | None, t_s: float) -> None:
+        """Beside whom the parallel filters accuse, those that the ranges do not tell from it; left out with it where that may be."""
         if rows is None:
             return
         for i in np.flatnonzero(rows["value"] >= rows["threshold"]):
             name = f"{rows['system'][i].decode()}{rows['prn'][i]:02d}"
-            rows["rivals"][i] = " ".join(self._ranges.rivals(name)).encode()
+            rivals = self._ranges.rivals(name)
+            rows["rivals"][i] = " ".join(rivals).encode()
+            if "parallel_filters" in self.response.spec.exclude and self._ranges.spare([name, *rivals], t_s):
+                self.response.accuse(rivals, t_s)
 
     def _noise_rows(self, watch: Watched, snap: Snapshot | None, sample: int, t_s: float, out) -> None:
         """Noise by redundant measurements, which is that of one integration; a normal point is the mean of several."""

@@ -148,6 +148,16 @@ class RangeMonitors:
         close = best > best[names.index(name)] - 2.0 * math.log(ODDS)
         return [n for n, c in zip(names, close) if c and n != name]
 
+    def spare(self, names: list[str], t_s: float) -> bool:
+        """Whether a fault would still be seen without these satellites and those left out already."""
+        last, gone = self._past[-1], self.response.out(t_s) | set(names)
+        keep = [n not in gone for n in last.names]
+        try:
+            parity_weight(last.h[keep], last.var[keep])
+        except ValueError:
+            return False
+        return True
+
     # -- bias bank ----------------------------------------------------------------------------------------------------
 
     def _biases(self, names, raw, h, var, sample, t_s, out) -> None:

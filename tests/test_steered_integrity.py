@@ -236,17 +236,22 @@ def test_rivals_are_those_of_the_likelihoods_written_out():
 
 
 def test_parallel_filters_name_whom_they_may_mean():
-    """Every alarm carries the satellites that the range monitors find as likely."""
+    """Every alarm carries the satellites that the range monitors find as likely, and they are left out while others can judge."""
     fault = lambda t: one(1, 0.6 * max(t - 10.0, 0.0))  # noqa: E731
     _, run, rows, _ = fly(
         {"parallel_filters": ALL["parallel_filters"], "bank_every": 5}, seconds=45.0, fault=fault
     )
     high = rows["parallel_filters"][rows["parallel_filters"]["value"] >= 90.0]
     assert len(high) and np.all(high["prn"] == 2)
-    run._ranges.rivals = lambda name: ["E01", "G07"]
     more = high[-1:].copy()
-    run._name_rivals(more)
-    assert more["rivals"][0] == b"E01 G07"
+    for rivals, out in ((["G03", "E06"], {"G03", "E06"}), ([f"E{k:02d}" for k in range(6, 11)], set())):
+        run.response = RespondSpec(exclude=["parallel_filters"]).start()
+        run._ranges.rivals, run._ranges.response = lambda name, r=rivals: r, run.response
+        run._name_rivals(more, 45.0)
+        assert more["rivals"][0] == " ".join(rivals).encode() and run.response.out(45.0) == out
+    run.response = RespondSpec().start()
+    run._name_rivals(more, 45.0)
+    assert not run.response.out(45.0)
 
 
 # ------------------------------------------------------------------------------------------------------- on IF samples
