@@ -13,6 +13,7 @@ integration (refused where they matter).
 """
 
 import copy
+import itertools
 import math
 from dataclasses import dataclass
 from functools import lru_cache
@@ -79,6 +80,7 @@ TWIN_EPOCH = np.dtype(
 """One integration of the twin."""
 
 _NEAR = 1024  # code lines kept on each side of a jammer, divided by (code periods in T)^2; see _near
+_LEAST = 3e-7  # of singular values and Chebyshev terms of tap vectors, over the largest singular value
 _MARGIN = 0.5  # how far the loops' frequency may leave the truth, in units of 1 / T, before a CW is held
 _MAX_TAPS = 512
 _MAX_TERMS = 512
@@ -391,6 +393,13 @@ def _tap_vectors(signal, prn, waveform, integration_s, x, taps):
 def _chebyshev(spec, low, high, taps):
     """Chebyshev coefficients of the tap vectors over f T in [low, high] -> (centre, half width), complex64
     (J, K).
+    """
+    span, series = _span(spec, low, high, taps)
+    return span, _series(*series)
+
+
+def _span(spec, low, high, taps):
+    """(centre, half width) and the arguments of `_series`.
 
     The sinc has exponential type pi: terms fall like (pi w / 2)^j / j!.
     """
@@ -403,7 +412,7 @@ def _chebyshev(spec, low, high, taps):
         )
     centre = 0.5 * (low + high)
     code = spec.signal, spec.prn, spec.waveform
-    return (centre, half), _series(*code, spec.integration_s, centre, half, n, tuple(taps.tolist()))
+    return (centre, half), (*code, spec.integration_s, centre, half, n, taps)
 
 
 @lru_cache(maxsize=256)
@@ -417,6 +426,18 @@ def _series(signal, prn, waveform, integration_s, centre, half, n, taps):
     out = (basis @ values).astype(np.complex64)
     out.flags.writeable = False
     return out
+
+
+@lru_cache(maxsize=256)
+def _singular(*series):
+    """`_series` as a product, complex64 (J, R) and (R, K): about one code line the tap vectors are almost
+    proportional, and two or three singular vectors hold what float32 does.
+    """
+    u, size, v = np.linalg.svd(_series(*series), full_matrices=False)
+    rank = max(int(np.sum(size > _LEAST * size[0])), 1)
+    weights = u[:, :rank] * size[:rank]
+    terms = np.flatnonzero(np.abs(weights).max(axis=1) > _LEAST * size[0])[-1] + 1
+    return np.ascontiguousarray(weights[:terms]), v[:rank]
 
 
 def jammer_hz(spec, jammer):
@@ -472,14 +493,14 @@ class _Stage:
     """What closed and open loop share: code, taps, noise, signs, echoes and interference of one trial."""
 
     def __init__(self, spec, seed, taps):
-        self.spec, self.taps = spec, taps
+        self.spec, self.taps, self.tap_key = spec, taps, tuple(taps.tolist())
         code = SIGNALS[spec.signal]
         self.length = code.code_length_chips
         self.line_hz = 1.0 / code.code_period_s
         self.acf, self.per_chip = _acf_table(spec.signal, spec.prn, spec.waveform, spec.bandwidth_hz)
         self.sigma = noise_sigma(spec.cn0_dbhz - spec.loss_db, spec.integration_s)
         factor = self.sigma * _noise_factor(
-            spec.signal, spec.prn, spec.waveform, spec.bandwidth_hz, tuple(taps.tolist())
+            spec.signal, spec.prn, spec.waveform, spec.bandwidth_hz, self.tap_key
         )
         self.factor = factor.astype(np.float32)
         self.key, self.symbol_key, self.wide_key, rng, echo_seed, self.nbi_seed = _keys(seed)
@@ -512,6 +533,11 @@ class _Stage:
         """Mid-interval times of a block."""
         return (block * BLOCK_EPOCHS + 0.5 + np.arange(BLOCK_EPOCHS)) * self.spec.integration_s
 
+    def ends_s(self, block):
+        """The first and the last of them."""
+        first = block * BLOCK_EPOCHS + 0.5
+        return first * self.spec.integration_s, (first + BLOCK_EPOCHS - 1) * self.spec.integration_s
+
 
 class _SlowNBI:
     """Noise of small B T: exact in time and over the taps, made in overlapped FFT blocks.
@@ -535,7 +561,7 @@ class _SlowNBI:
                 f"bandwidth_hz = {jammer.bandwidth_hz:g} is below {4 * grid:.3g}, the least the twin resolves "
                 f"at T = {self.T:g} s; use a CW jammer"
             )
-        (centre, half), self.vectors = _chebyshev(spec, low * self.T, high * self.T, stage.taps)
+        (centre, half), self.vectors = _chebyshev(spec, low * self.T, high * self.T, stage.tap_key)
         u = np.clip((self.bins * grid * self.T - centre) / half, -1.0, 1.0)
         turn = 0.5 * self.bins * grid * self.T  # block start to mid-interval
         terms = np.cos(np.outer(np.arange(len(self.vectors)), np.arccos(u)))
@@ -811,25 +837,25 @@ class TwinRun:
         Asked for the whole block where the truth is the twin's own, so that cutting a run changes nothing.
         """
         s = self.stage
-        ranges = _reach(s.cws, s.mid_s(index), freq_hz, self.spec.integration_s)
+        low_hz, high_hz = freq_hz.min(), freq_hz.max()
+        ranges = _reach(s.cws, s.ends_s(index), low_hz, high_hz, self.spec.integration_s)
         if self._spans is not None and _covers(self._spans[0], ranges):
             return
         spans, vectors, row = [], [np.zeros((0, len(s.taps)), np.complex64)], 0
         for low, high in ranges:
-            span, v = _chebyshev(self.spec, low - _MARGIN, high + _MARGIN, s.taps)
+            span, v = _chebyshev(self.spec, low - _MARGIN, high + _MARGIN, s.tap_key)
             spans.append([*span, row, len(v)])
             vectors.append(v)
             row += len(v)
         self._spans = np.array(spans, float).reshape(-1, 4), np.concatenate(vectors)
 
 
-def _reach(cws, mid_s, freq_hz, T):
-    """f T of each CW relative to the signal over a block, list of (low, high)."""
-    low, high = freq_hz.min(), freq_hz.max()
+def _reach(cws, ends_s, low_hz, high_hz, T):
+    """f T of each CW relative to a signal between two frequencies over a block, list of (low, high)."""
     out = []
     for f, rate, *_ in cws.tolist():
-        ends = f + rate * mid_s[0], f + rate * mid_s[-1]
-        out.append(((min(ends) - high) * T, (max(ends) - low) * T))
+        ends = f + rate * ends_s[0], f + rate * ends_s[1]
+        out.append(((min(ends) - high_hz) * T, (max(ends) - low_hz) * T))
     return out
 
 
@@ -917,8 +943,10 @@ class OpenLoopRun:
             row += 1
         shift_s = self.spec.code_phase_chips / CHIP_RATE_HZ
         for j, (centre, half), terms in lines:
-            part = self.inner[row : row + 2 * terms]
-            cw_sequences(s.cws[j], centre, half, index * n, self.spec.integration_s, shift_s, jam, part)
+            part, weights = self.inner[row : row + 2 * terms], self._series[j][2]
+            cw_sequences(
+                s.cws[j], centre, half, index * n, self.spec.integration_s, shift_s, jam, weights, part
+            )
             row += 2 * terms
         for nbi in self._slow:
             for x in nbi.sequence(index, s.mid_s(index)):
@@ -947,16 +975,16 @@ class OpenLoopRun:
 
     def _lines(self, index):
         """(jammer, span, number of terms) of each CW that is on in a block; fills their tap vectors."""
-        s = self.stage
-        mid_s = s.mid_s(index)
+        s, T = self.stage, self.spec.integration_s
+        first_s, last_s = ends_s = s.ends_s(index)
         out = []
-        for j, (low, high) in enumerate(_reach(s.cws, mid_s, np.zeros(1), self.spec.integration_s)):
-            if s.cws[j, 4] > mid_s[-1] or s.cws[j, 5] <= mid_s[0]:
+        for j, (low, high) in enumerate(_reach(s.cws, ends_s, 0.0, 0.0, T)):
+            if s.cws[j, 4] > last_s or s.cws[j, 5] <= first_s:
                 continue
-            if (j, low, high) not in self._series:
-                self._series = {key: v for key, v in self._series.items() if key[0] != j}
-                self._series[j, low, high] = _chebyshev(self.spec, low, high, s.taps)
-            span, vectors = self._series[j, low, high]
+            if j not in self._series or self._series[j][0] != (low, high):
+                span, series = _span(self.spec, low, high, s.tap_key)
+                self._series[j] = (low, high), span, *_singular(*series)
+            _, span, _, vectors = self._series[j]
             out.append((j, span, len(vectors)))
         return tuple(out)
 
@@ -964,15 +992,12 @@ class OpenLoopRun:
         if self._key == (lines, n_echo):
             return
         self._key = lines, n_echo
-        series = {key[0]: v for key, (_, v) in self._series.items()}
-        vectors = [series[j] for j, *_ in lines] + [n.vectors for n in self._slow]
+        vectors = [self._series[j][3] for j, *_ in lines] + [n.vectors for n in self._slow]
         K, first = self.n_taps, 1 + n_echo
         terms = first + 2 * sum(map(len, vectors))
-        self.left = np.zeros((K, terms + K), np.float32)
-        self.left[:, 0], self.left[:, terms:] = self.R, self.stage.factor
-        if vectors:
-            joined = np.concatenate(vectors)
-            self.left[:, first:terms:2] = joined.real.T
-            self.left[:, first + 1 : terms : 2] = joined.imag.T
         if self.inner.shape[0] != terms + K:
+            self.left = np.zeros((K, terms + K), np.float32)
+            self.left[:, 0], self.left[:, terms:] = self.R, self.stage.factor
             self.inner = np.empty((terms + K, 2 * BLOCK_EPOCHS), np.float32)
+        for vector, row in zip(itertools.chain(*vectors), range(first, terms, 2)):
+            self.left[:, row], self.left[:, row + 1] = vector.real, vector.imag

@@ -95,15 +95,16 @@ def _cycles(turn):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def cw_sequences(cw, centre, half_width, epoch0, integration_s, shift_s, signs, out):
-    """Open-loop time sequences of a CW, one for each Chebyshev term of its tap vector.
+def cw_sequences(cw, centre, half_width, epoch0, integration_s, shift_s, signs, weights, out):
+    """Open-loop time sequences of a CW, one for each of its tap vectors.
 
-    Row j: s_e A T_j(u) e^{2 pi i psi(t)}, u = (f T - centre) / half_width, t mid-interval - ``shift_s``; by
-    rotation and recurrence from the first epoch. ``cw`` = (f_hz, rate_hz_s, phase_cycles, amplitude,
-    start_s, end_s); ``out`` float32 (2 J, 2 E): row 2 j in-phase | quadrature, row 2 j + 1 the same times i.
+    Number r: s_e A p_r(u) e^{2 pi i psi(t)}, p_r = sum_j weights[j, r] T_j, u = (f T - centre) / half_width, t mid-interval -
+    ``shift_s``; by rotation and recurrence from the first epoch. ``cw`` = (f_hz, rate_hz_s, phase_cycles, amplitude,
+    start_s, end_s); ``weights`` complex64 (J, R); ``out`` float32 (2 R, 2 E): row 2 r in-phase | quadrature, row 2 r + 1 the
+    same times i.
     """
     n = signs.shape[0]
-    terms = out.shape[0] // 2
+    terms, ranks = weights.shape
     t = (epoch0 + 0.5) * integration_s - shift_s
     step_t2 = cw[1] * integration_s * integration_s
     z = _cycles(cw[2] + (cw[0] + 0.5 * cw[1] * t) * t)
@@ -112,7 +113,7 @@ def cw_sequences(cw, centre, half_width, epoch0, integration_s, shift_s, signs, 
     u = ((cw[0] + cw[1] * t) * integration_s - centre) / half_width
     du = step_t2 / half_width
     # In pieces: rows are then written in line, and the recurrence over the terms runs in vectors.
-    work = np.empty((5, _PIECE))
+    work, sums = np.empty((5, _PIECE), np.float32), np.empty((2, ranks, _PIECE), np.float32)
     re, im, us, older, now = work[0], work[1], work[2], work[3], work[4]
     for begin in range(0, n, _PIECE):
         m = min(_PIECE, n - begin)
@@ -123,25 +124,39 @@ def cw_sequences(cw, centre, half_width, epoch0, integration_s, shift_s, signs, 
             z *= w
             w *= w2
             u += du
+        sums[:] = 0.0
         for j in range(terms):
-            _term(out, 2 * j, begin, m, re, im, us, older, now)
+            _add_term(sums, weights, j, work)
+        for r in range(ranks):
+            _turned(out, 2 * r, begin, m, sums, r, work)
 
 
-@njit(error_model="numpy")
-def _term(out, row, begin, m, re, im, us, older, now):
-    """One term of ``cw_sequences`` over a piece, and the step to the next."""
+@njit(error_model="numpy", fastmath={"contract"})
+def _add_term(sums, weights, j, work):
+    """Every sum with its share of T_j; then T_j+1 = 2 u T_j - T_j-1."""
+    for r in range(weights.shape[1]):
+        x, y = weights[j, r].real, weights[j, r].imag
+        for e in range(_PIECE):
+            i = _U(e)
+            sums[0, r, i] += x * work[4, i]
+            sums[1, r, i] += y * work[4, i]
+    for e in range(_PIECE):
+        i = _U(e)
+        following = _F(2) * work[2, i] * work[4, i] - work[3, i]
+        work[3, i] = work[4, i]
+        work[4, i] = following
+
+
+@njit(error_model="numpy", fastmath={"contract"})
+def _turned(out, row, begin, m, sums, r, work):
+    """A piece of a sequence under its carrier, and times i in the row below."""
     n = out.shape[1] // 2
-    in_phase, quadrature = out[row, begin : begin + m], out[row, n + begin : n + begin + m]
-    turned_i, turned_q = out[row + 1, begin : begin + m], out[row + 1, n + begin : n + begin + m]
+    o, q = _U(begin), _U(n + begin)
     for e in range(m):
         i = _U(e)
-        x, y = _F(now[i] * re[i]), _F(now[i] * im[i])
-        in_phase[i], quadrature[i], turned_i[i], turned_q[i] = x, y, -y, x
-    for e in range(m):
-        i = _U(e)
-        following = 2.0 * us[i] * now[i] - older[i]
-        older[i] = now[i]
-        now[i] = following
+        a, b, c, d = sums[0, r, i], sums[1, r, i], work[0, i], work[1, i]
+        x, y = a * c - b * d, a * d + b * c
+        out[row, o + i], out[row, q + i], out[row + 1, o + i], out[row + 1, q + i] = x, y, -y, x
 
 
 @njit(error_model="numpy")
