@@ -300,7 +300,7 @@ class Riss11(_Riss):
     Gyro and odometer errors as first-order Gauss-Markov processes (eq. 19, 20); white noise only there and
     on the clock drift, as printed (the expanded vector's 0 in place of sigma_d is a misprint).
     ``heading_noise_deg_rth`` adds the gyro's angular random walk, ``velocity_noise_mps2_rthz`` white
-    acceleration on the three velocities; both are 0 in the seed. The sizes of the odometer process are not
+    acceleration on the three velocities; both are 0 in the paper. The sizes of the odometer process are not
     stated there: assumed.
     """
 

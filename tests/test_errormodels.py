@@ -124,7 +124,7 @@ def test_pinson13_f_matches_the_numerical_jacobian(monkeypatch):
     s = pinson_state(0.7, 0.3, 3000.0, [150.0, 90.0, 4.0], rotation_vector(np.array([0.1, -0.2, 0.4])))
     f_b, w_b = np.array([1.0, 0.5, 9.6]), np.array([0.01, 0.02, -0.03])
     f = model.f_matrix(s, f_b)
-    # rho depends on height: V/R^2 per metre; the seed leaves these entries of column 9 out.
+    # rho depends on height: V/R^2 per metre; the thesis leaves these entries of column 9 out.
     vr2 = np.linalg.norm(s.vel_n_mps) / radius**2
     scale = np.array([1e-4] * 6 + [1.0] * 3 + [1.0, 1.0, 1.0, 1.0])
     dt = 1e-2

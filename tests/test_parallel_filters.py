@@ -65,7 +65,7 @@ def test_bank_is_the_textbook_one_through_a_failure():
 
 
 def test_threshold_identity():
-    """The seed's limit 64 over 18 seconds; not the false-alarm rate (residuals share one error)."""
+    """The thesis's limit 64 over 18 seconds; not the false-alarm rate (residuals share one error)."""
     assert chi2.sf(64, 18) == pytest.approx(4.55e-7, rel=0.01)
 
 

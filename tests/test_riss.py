@@ -104,7 +104,7 @@ def test_f_is_the_jacobian_of_the_mechanisation(model):
     unit = np.ones(model.n)
     unit[:2] = 1.5e-7  # 1 m in rad: compare what a metre, m/s, rad does per second
     scaled, difference = f * unit / unit[:, None], (numeric - f) * unit / unit[:, None]
-    # Rounding of a latitude (a few 1e-16 rad) over step and interval; the seed leaves v/R dh out of F.
+    # Rounding of a latitude (a few 1e-16 rad) over step and interval; the paper leaves v/R dh out of F.
     step = np.array([STEPS.get(name, 1e-3) for name in model.names])
     rounding = 4e-16 / (2 * step * dt) * unit / 1.5e-7
     allowed = 2e-7 + 0.0035 * np.abs(scaled)
@@ -139,7 +139,7 @@ def test_measurement_rows_are_the_jacobian_of_range_and_rate(model):
             e = np.zeros(model.n)
             e[j] = 1e-7 if name.startswith(("dlat", "dlon")) else 1e-4
             numeric = (predicted(e, rate) - predicted(-e, rate)) / (2 * e[j])
-            # R_l^e turns with position: v per rad (10 m/s) is left out of the rate rows, as in the seed.
+            # R_l^e turns with position: v per rad (10 m/s) is left out of the rate rows, as in the paper.
             atol = (
                 10.5 if rate and name.startswith(("dlat", "dlon")) else 1e-5 + 1e-6 * np.abs(rows[:, j]).max()
             )

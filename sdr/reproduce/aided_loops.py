@@ -1,6 +1,6 @@
 """High dynamics (the profile of Abdel-Hafez's papers): loops with and without inertial aid at the same bandwidth, and ultra-tight.
 
-The seeds show the acceleration as a figure without numbers; amplitudes and periods are assumed (``signals.trajectory.
+The papers show the acceleration as a figure without numbers; amplitudes and periods are assumed (``signals.trajectory.
 HighDynamics``, 1 g, and six times that). Twin of 8 satellites, C/N0 44 dB-Hz, T = 20 ms, tactical IMU; second-order FLL,
 carrier-aided DLL. A channel is lost when its replica is off by more than one chip or 30 Hz.
 """

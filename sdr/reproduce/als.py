@@ -1,6 +1,6 @@
 """Abdel-Hafez, autocovariance least squares, on the exact linear model of the ultra-tight filter.
 
-The seed shows its results in figures without numbers: 10 m and 30 m noise, N = 1 ("very close ... small offset") and
+The paper shows its results in figures without numbers: 10 m and 30 m noise, N = 1 ("very close ... small offset") and
 N = 2 ("right on the true simulated standard deviation"), off-diagonals "much closer to being zero in mean" with N = 2.
 """
 
@@ -77,7 +77,7 @@ def rows_of(mc: dict, sigma: float, n_d: int, n_lags: int, rate_hz: float) -> li
     rows = []
     if n_lags == 1:
         plain, p_low, p_high = mean_interval(mc["plain_sigma"])
-        note = "the seed's 'small offset' curve: no compensation of the filter's own error"
+        note = "the paper's 'small offset' curve: no compensation of the filter's own error"
         offset = "reproduced" if p_low > sigma else "not reproduced"
         rows.append(row(f"sigma uncompensated, {where}", sigma, plain, p_low, p_high, offset, note))
         note = "seed, N = 1: small offset. A correct ALS has none: lag 0 already identifies R"
@@ -112,7 +112,7 @@ def offdiagonal_rows(problem, log, settle, n_d, runs, rng) -> tuple[list[dict], 
         item = f"off-diagonals ALS N=2, {sigma:.0f} m, Nd {n_d}"
         rows.append(row(item, "closer to zero than N=1", ours, None, None, verdict, note))
         one = float(np.sqrt(np.mean(kept[sigma, 1]["off"].mean(axis=0) ** 2)))
-        note = "as good as N = 2 (same residuals model): the seed's difference is uncompensated against compensated"
+        note = "as good as N = 2 (same residuals model): the paper's difference is uncompensated against compensated"
         rows.append(row(f"off-diagonals ALS N=1, {sigma:.0f} m, Nd {n_d}", None, one, note=note))
     return rows, kept
 
@@ -230,7 +230,7 @@ def joint_rows(n_d, runs, rng) -> list[dict]:
 
 
 def figures(out: Path, kept: dict, off: dict, n_d: int, unequal: tuple) -> None:
-    """The seed's figures 2-10 with ours, plus the unequal case."""
+    """The paper's figures 2-10 with ours, plus the unequal case."""
     t = np.arange(0, 60, 0.05)
     fig, axes = new_figure(3, 1, sharex=True)
     for i, name in enumerate(("east", "north", "up")):

@@ -1,6 +1,6 @@
 """Abdel-Hafez, bias bank, in the measurement domain: the filter's error is projected out, so it is exact.
 
-Figures 3-10 of the seed show the probabilities of the hypotheses 0, 5 and 10 m on the biased satellite: covariance 1
+Figures 3-10 of the paper show the probabilities of the hypotheses 0, 5 and 10 m on the biased satellite: covariance 1
 (second satellite), 2.1 and 12.5 (third satellite), true biases 10, 7 and 20 m. Numbers are not printed; the text says
 what converged. The grid besides 0, 5 and 10 is assumed to be -10 and -5 ("distributed around the null hypothesis").
 """
@@ -60,7 +60,7 @@ def share(hits) -> tuple[float, float, float]:
 
 
 def figure_rows(runs: int, epochs: int, rng) -> tuple[list[dict], dict]:
-    """One block per figure of the seed."""
+    """One block per figure of the paper."""
     rows, kept = [], {}
     for number, var, bias, sat in FIGURES:
         log_p = posterior(residuals(rng, runs, epochs, var, bias, sat), var)
@@ -190,7 +190,7 @@ def redetection(runs: int, rng) -> tuple[list[dict], dict]:
     bb.run_many_linear(*args)
     with np.errstate(invalid="ignore"):
         found, low, high = share((out[:, 300:, target] > 0.99).any(axis=1))
-    note = "the hypothesis had underflowed to 0; the seed says 'repeated periodically', which restarts it"
+    note = "the hypothesis had underflowed to 0; the paper says 'repeated periodically', which restarts it"
     rows.append(
         row("bias after 300 clean epochs, eq. 19 as printed: detected", None, found, low, high, note=note)
     )
@@ -218,7 +218,7 @@ def fit_rows(runs: int, rng) -> list[dict]:
 
 
 def figures(out: Path, kept: dict, again: dict) -> None:
-    """The seed's figures 2-10 with ours."""
+    """The paper's figures 2-10 with ours."""
     fig, axes = new_figure(3, 1, sharex=True)
     t = np.arange(0, 60, 0.05)
     for i, name in enumerate(("east", "north", "up")):

@@ -1,6 +1,6 @@
 """The high-acceleration profile of Abdel-Hafez's papers as a linear filter problem (phi, Qd, H), without IF samples.
 
-The seeds give a figure of the acceleration and "small angular velocity" only; amplitudes, periods, IMU grade, geometry
+The papers give a figure of the acceleration and "small angular velocity" only; amplitudes, periods, IMU grade, geometry
 and initial covariance are assumptions of this project, named here once.
 """
 
