@@ -498,7 +498,11 @@ def figures(out: Path, s: Scene, kept: dict, noise: dict, seed: int) -> None:
     residual_figure(out, "fig06_nominal", "Vanek 1999 fig. 6, Case II: nominal", quiet)
     error_figure(out, "fig07_nominal_errors", "Vanek 1999 fig. 7, Case II: nominal", s, {"adaptive": quiet})
     merit_figure(
-        out, "fig07_nominal_merit", "Vanek 1999 fig. 7: mean figure of merit", {"nominal": quiet}, ((0, None),)
+        out,
+        "fig07_nominal_merit",
+        "Vanek 1999 fig. 7: mean figure of merit",
+        {"nominal": quiet},
+        ((0, None),),
     )
     plots = (
         (8, 9, 10, 11, "Table 2 step", STEPS, 22, step_fault, None, "22 ft step"),
