@@ -93,7 +93,8 @@ def _accumulate(
     flat = parts.reshape((2 + q) * n, n)
     turned = np.empty_like(parts)
     # Transposed, so that all parts are one product: H P of this epoch, and the propagated C of the last ones, by age.
-    hp = np.empty((2 + q, p, n))
+    hp = np.zeros((2 + q, p, n))
+    stacked = hp.reshape((2 + q) * p, n)
     ct = np.zeros((lags, 2 + q, p, n))
     used_then = np.zeros((lags, p))
     for e in range(e_count):
@@ -119,13 +120,12 @@ def _accumulate(
             for a in range(p):
                 for b in range(p):
                     counts[j, a, b] += we[a] * used_then[old, b]
-        pht = np.dot(flat, ht).reshape(2 + q, n, p)
-        for i in range(2 + q):
-            for x in range(n):
-                for a in range(p):
-                    hp[i, a, x] = pht[i, x, a]
-        stacked = hp.reshape((2 + q) * p, n)
         if e >= settle:
+            pht = np.dot(flat, ht).reshape(2 + q, n, p)
+            for i in range(2 + q):
+                for x in range(n):
+                    for a in range(p):
+                        hp[i, a, x] = pht[i, x, a]
             blocks = np.dot(stacked, ht).reshape(2 + q, p, p)
             for i in range(2 + q):
                 block = blocks[i]
@@ -155,14 +155,15 @@ def _accumulate(
         for j in range(1, min(lags - 1, e - settle + 1)):
             old = (e - j) % lags
             ct[old] = np.dot(ct[old].reshape((2 + q) * p, n), at).reshape(2 + q, p, n)
-        now = e % lags
-        ct[now] = np.dot(stacked, at).reshape(2 + q, p, n)
-        for i in range(q):
-            a, b = pairs[i, 0], pairs[i, 1]
-            ct[now, 2 + i, b] -= l_rows[:, a]
-            if a != b:
-                ct[now, 2 + i, a] -= l_rows[:, b]
-        used_then[now] = we
+        if e >= settle:
+            now = e % lags
+            ct[now] = np.dot(stacked, at).reshape(2 + q, p, n)
+            for i in range(q):
+                a, b = pairs[i, 0], pairs[i, 1]
+                ct[now, 2 + i, b] -= l_rows[:, a]
+                if a != b:
+                    ct[now, 2 + i, a] -= l_rows[:, b]
+            used_then[now] = we
         # P' = Abar (P Abar')  as two stacked products, P symmetric.
         right = np.dot(flat, at).reshape(2 + q, n, n)
         for i in range(2 + q):

@@ -88,6 +88,7 @@ class NormalPoints:
         m = 2 * slots
         self.slots, self.length, self.count = slots, length, 0
         self.names: list[str | None] = [None] * slots
+        self._all = np.ones(slots, np.bool_)
         self.z, self.own, self.seen = np.zeros(m), np.ones(m), np.zeros(m, np.bool_)
         self.h, self.dx = np.zeros((m, n)), np.zeros(n)
         self._gain = np.repeat(np.array([clock, drift]), slots)
@@ -110,9 +111,11 @@ class NormalPoints:
         """
         first, self._start = self._start, p.copy()
         # A slot that changed hands within the window holds two satellites' ranges.
-        kept = np.array([a == b for a, b in zip(names, self.names)])
+        kept = self._all
+        if names != self.names:
+            kept = np.array([a == b for a, b in zip(names, self.names)])
         log = self._views[self.count % self.length]
-        self.names, self.epochs = list(names), int(max(self._sums[-1].max(), 1))
+        self.names, self.epochs = names, max(int(self._sums[-1].max()), 1)
         finish(
             kept, scale, self._start if first is None else first, first is not None, *self._sums, self.z, self.h, self.own,
             self.seen, self.single, self.dx, log.phi, log.qd, log.p, log.h, log.k, log.r, log.var, log.used,

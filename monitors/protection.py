@@ -261,6 +261,15 @@ def quick_levels(h_enu: np.ndarray, var: np.ndarray, spec: Protection) -> tuple[
 
 
 @njit(cache=True, nogil=True)
+def all_positive(var, seen):
+    """Whether the variances of all rows i < ``var.size`` that were ``seen`` are above zero."""
+    for i in range(var.size):
+        if seen[i] and not var[i] > 0.0:
+            return False
+    return True
+
+
+@njit(cache=True, nogil=True)
 def innovation_ratios(h, p, z, var, seen, out):
     """z_i^2 / (h_i P h_i' + R_i) of the rows i < ``var.size`` that were ``seen``, in a row into ``out``."""
     k = 0

@@ -8,7 +8,7 @@ import numpy as np
 from monitors.bias_bank import chi2_limit
 from monitors.normal_points import NormalPoints
 from monitors.parallel_filters import BankReport, PacedBank
-from monitors.protection import innovation_ratios
+from monitors.protection import all_positive, innovation_ratios
 from nav.navlog import NavigatorLog
 from sdr.findings import Alarms, found
 from sdr.respond import Response
@@ -44,11 +44,12 @@ class FilterMonitors:
         log = watch.log
         if log is None:
             return self._lack(watch.reason)
-        names, var = [str(n) for n, x in zip(log.names, log.seen) if x], self._variances(log)
-        if not np.all((var > 0) | ~log.seen[: log.slots]):
+        var = self._variances(log)
+        if not all_positive(var, log.seen):
             return self._lack("the filter's range variances are not all above zero")
         if not math.isfinite(log.z.sum()):
             return self._lack("the filter's innovations are not finite numbers")
+        names = [str(n) for n, x in zip(log.names, log.seen.tolist()) if x]
         self._innovations(log, names, var, sample, t_s, out)
         dx, p = self._parallel(watch, log, names, var, sample, t_s, out)
         if p is not None and self._als is not None:
@@ -77,11 +78,13 @@ class FilterMonitors:
             return
         ratio, limit = np.empty(len(names)), chi2_limit(1, self.spec.innovation.p_false_alarm)
         innovation_ratios(log.h, log.last().p, log.z, var, log.seen, ratio)
-        out["innovation"] = part = found(names, sample, t_s, ratio, limit)
+        out["innovation"] = found(names, sample, t_s, ratio, limit)
+        if "innovation" not in self.response.spec.exclude:
+            return
         # One satellite that stands out; when most do, the noise is wrong and no satellite is at fault.
-        high = part["value"] > limit
-        if "innovation" in self.response.spec.exclude and 2 * high.sum() < len(names):
-            self.response.accuse([n for n, x in zip(names, high) if x], t_s)
+        high = [n for n, x in zip(names, ratio.tolist()) if x > limit]
+        if 2 * len(high) < len(names):
+            self.response.accuse(high, t_s)
 
     # -- noise ----------------------------------------------------------------------------------------------------------
 

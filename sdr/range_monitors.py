@@ -87,10 +87,11 @@ class RangeMonitors:
         shift = self.response.shifts(snap.names)
         h = np.empty((len(snap.names), 5))
         h[:, :3], h[:, 3], h[:, 4] = -snap.los, 1.0, snap.second
-        self._past.append(Ranges(snap.names, snap.residual_m + shift, h, var))
+        raw = snap.residual_m + shift
+        self._past.append(Ranges(snap.names, raw, h, var))
         del self._past[:-RECENT]
         self._raim(snap, h, var, sample, t_s, out)
-        self._biases(snap.names, snap.residual_m + shift, h, var, sample, t_s, out)
+        self._biases(snap.names, raw, h, var, sample, t_s, out)
         self._protect(snap, h, var, sample, t_s, out)
 
     # -- RAIM ---------------------------------------------------------------------------------------------------------
@@ -247,13 +248,15 @@ class BiasTracker:
 
     def suspect(self, report: BiasReport) -> tuple[str, float, float]:
         """(satellite, probability of its bias or 0 when it does not fit, bias in m) of the most probable bias."""
-        best = 1 + int(np.argmax(report.probability[1:]))  # the first is that of no bias
+        best = 1 + int(report.probability[1:].argmax())  # the first is that of no bias
         value = float(report.probability[best]) if report.fits or report.best != best else 0.0
         return self.names[int(report.row[best])], value, float(report.bias_m[best])
 
     def faulty(self, report: BiasReport, before: str | None) -> str | None:
         """The satellite that is biased by whatever size, as probable as ``declare`` wants; ``before`` stays while some bias is likelier
         than none, whoever has it."""
+        if report.probability[0] > 0.5:
+            return None
         of = np.bincount(report.row, np.where(report.bias_m != 0, report.probability, 0.0), len(self.names))
         top = int(np.argmax(of))
         if of[top] >= self.spec.declare and report.fits:
