@@ -13,7 +13,7 @@ from sdr import iffile
 from tracking.acquisition import AcquisitionSpec, acquire
 
 COMMON_RATES_HZ = tuple(
-    1e6 * r
+    float(round(1e6 * r))  # 1e6 * 2.046 lies below 2046000
     for r in (
         *(2.046, 2.048, 2.4, 2.5, 2.6, 2.8, 3.2, 4.0, 4.092, 4.096, 5.0, 5.456, 6.0, 6.625, 8.0, 8.184),
         *(10.0, 12.0, 12.5, 16.0, 16.368, 20.0, 20.46, 24.0, 25.0, 26.0, 30.0, 40.0, 50.0),

@@ -312,6 +312,8 @@ def open_recording(path: Path | str, declared: Declaration) -> "RecordingSource"
             f"'{data}' holds real samples ({fmt.name}): give their intermediate frequency (--if-hz)"
         )
     if_hz = float(if_hz or 0.0)
+    if fs_hz > _MAX_FILE_HZ:
+        raise ValueError(f"fs_hz = {fs_hz:g} is beyond what is read, {_MAX_FILE_HZ:g}: give it in Hz")
     check_sampling(fs_hz, if_hz, fmt.complex)
     first, n = _span(declared, fmt, fs_hz)
     return RecordingSource(declared, fmt, fs_hz, if_hz, first, n)

@@ -10,18 +10,18 @@ import numpy as np
 
 from nav.sensor_files import write_barometer, write_imu, write_odometer
 from nav.steering import Sensors
-from sdr import iffile, scenario, toml
+from sdr import holes, iffile, scenario, toml
 from sdr.modes import SideBySide, table
 from sdr.modes import draw as draw_modes
 from sdr.progress import progress
 from sdr.receiver import Outcome, Receiver
 from sdr.scenario import ReceiverSpec, Scenario
-from sdr.spectrum import EVERY_S, Watched
+from sdr.spectrum import EVERY_S, STRONG_DB, Spectrogram
 from sdr.store import Store
 from sdr.watch.post import report_lines, totals
 from signals.geodesy import ecef_to_geodetic
 from signals.modulation import SIGNALS
-from tracking.acquisition import AcquisitionSpec, slab_samples
+from tracking.acquisition import AcquisitionSpec, lowest_rate_hz, slab_samples
 from tracking.acquisition import acquire as search
 from tracking.channel import STATE_LOCKED
 from tracking.loops import dll_jitter_chips, pll_jitter_cycles
@@ -29,6 +29,10 @@ from tracking.loops import dll_jitter_chips, pll_jitter_cycles
 if TYPE_CHECKING:
     from sdr.__main__ import Recording
 
+SILENT_DB = 80.0
+"""No converter's noise lies so far below a line: there is none."""
+MOST_HOLES = 5
+"""Holes in a recording that are listed in words."""
 SYSTEM_LETTER = {"L1CA": "G", "E1B": "E", "E1C": "E"}
 
 
@@ -47,7 +51,7 @@ def run(
     path = Path(output) if output else Path(f"{spec.name}.h5")
     with Store(path, command="run", scenario=text, seed=spec.seed) as store:
         side = (
-            SideBySide(spec, Watched(source), scenario.sensors(spec))
+            SideBySide(spec, Spectrogram(source), scenario.sensors(spec))
             if spec.receiver.steering.compare
             else None
         )
@@ -159,6 +163,7 @@ def acquire(
     given = {"doppler_range_hz": doppler_hz, "p_fa": p_fa}
     spec = toml.validate(AcquisitionSpec, {k: v for k, v in given.items() if v is not None}, "acquire")
     source = iffile.open_recording(file, iffile.declaration(file, recording))
+    signals = [s for s in signals if source.fs_hz >= lowest_rate_hz(s)] or signals
     n = max(slab_samples(s, source.fs_hz, spec) for s in signals)
     n0, iq = _first(source, file, n)
     rows = np.concatenate([search(iq, n0, source.fs_hz, source.if_hz, s, None, spec) for s in signals])
@@ -187,13 +192,13 @@ def _first(source: Any, file: Path, n: int) -> tuple[int, np.ndarray]:
 
 def _scenario(name: str, overrides: Sequence[str], threads: int) -> tuple[Scenario, str]:
     spec, text = scenario.load(
-        name, [*overrides, f"receiver.tracking.threads={threads}"] if threads > 1 else overrides
+        name, [*overrides, f"receiver.tracking.threads={threads}"] if threads != 1 else overrides
     )
     return spec, text
 
 
 def _receiver(name: str | None, overrides: Sequence[str], threads: int) -> tuple[ReceiverSpec, str]:
-    if threads > 1:
+    if threads != 1:
         overrides = [*overrides, f"receiver.tracking.threads={threads}"]
     if name is not None:
         spec, text = scenario.load(name, overrides)
@@ -212,6 +217,7 @@ class _Tally:
         self.fixes: list[np.ndarray] = []
         self.used: dict[str, None] = {}
         self.levels: list[np.ndarray] = []
+        self.holes: list[dict[str, float]] = []
 
     def stanford(self, source: Any, receiver: Receiver) -> dict[str, Any] | None:
         """Counts of the Stanford diagram, horizontal and vertical; None without truth or protection levels."""
@@ -234,11 +240,11 @@ def _receive(
     sensors: Sensors | None = None,
     side: SideBySide | None = None,
 ) -> dict[str, Any]:
-    watched = side.source if side else Watched(source)
+    watched = side.source if side else Spectrogram(source)
     receiver = side.primary if side else Receiver(spec, watched, sensors)
     spectra = {"samples/spectrum": watched}
     if receiver.mitigation:
-        receiver.source = spectra["mitigation/spectrum"] = Watched(receiver.mitigation)
+        receiver.source = spectra["mitigation/spectrum"] = Spectrogram(receiver.mitigation)
     truth = _Truth(source, store)
     tally = _Tally()
     begin = time.perf_counter()
@@ -266,6 +272,7 @@ def _receive(
         "monitors": _monitors(receiver, source),
         "protection": tally.stanford(source, receiver),
         "steering": None if receiver.steering is None else receiver.steering.summary(),
+        "holes": tally.holes,
     }
     result["monitor_totals"] = totals(result["monitors"])
     if side:
@@ -273,8 +280,32 @@ def _receive(
         result["modes"] = side.modes()
     result["fix"], result["no_fix_reason"] = _fix(receiver, source, tally), None
     if result["fix"] is None:
-        result["no_fix_reason"] = _why_no_fix(receiver, duration_s, result["satellites"])
+        heard = list(spectra.values())[-1]
+        why = _why_no_fix(receiver, duration_s, result["satellites"]), _interference(receiver, heard)
+        result["no_fix_reason"] = "; ".join(part.rstrip(".") for part in why if part)
     return result
+
+
+def _interference(receiver: Receiver, heard: Spectrogram) -> str:
+    """What the spectrum of the samples that were received has to say of it; empty if nothing."""
+    lines_hz, jn_db = heard.lines()
+    if jn_db < STRONG_DB:
+        return ""
+    if jn_db > SILENT_DB:
+        return "the samples hold one level and nothing else: the recorder was not running, or the format is another"
+    what = f"narrow interference at {lines_hz[0] / 1e3:+.0f} kHz from the carrier"
+    if len(lines_hz) > 1:
+        what += f" and {len(lines_hz) - 1} more lines"
+    kind = "Notch" if len(lines_hz) == 1 else "Excision"
+    done = receiver.spec.mitigation
+    cure = "receive a complex recording with receiver.mitigation, or filter it before"
+    if getattr(receiver.source, "complex", True):
+        cure = f'use --set receiver.mitigation={{kind="{kind}"}} (in quotes)'
+    if done is not None:
+        cure = f"this is what {done.kind} leaves of it; " + (
+            cure if done.kind != kind else "no mitigation here takes more"
+        )
+    return f"there is {what}, {jn_db:.0f} dB over the noise of the whole band: {cure}"
 
 
 def _store_outcome(store: Store, receiver: Receiver, outcome: Outcome, tally: _Tally) -> None:
@@ -311,6 +342,9 @@ def _store_outcome(store: Store, receiver: Receiver, outcome: Outcome, tally: _T
         store.append("navigation/steering", np.concatenate(outcome.steering))
     for rows in outcome.views:
         store.append("navigation/satellites", rows)
+    for rows in outcome.holes:
+        store.append("navigation/holes", rows)
+        tally.holes += holes.told(rows)
     for row in outcome.solutions:
         store.append("navigation/solution", row, fs_hz=receiver.fs_hz, **_leap(receiver))
         if row["valid"][0]:
@@ -462,6 +496,9 @@ def _summary(result: dict[str, Any]) -> str:
             f"position {fix['lat_deg']:.7f} deg, {fix['lon_deg']:.7f} deg, {fix['height_m']:.2f} m: {fix['epochs']} fixes "
             f"from {fix['first_s']:.1f} s on with {len(fix['used'])} satellites{error}"
         )
+    rows += [holes.sentence(h) for h in result["holes"][:MOST_HOLES]]
+    if len(result["holes"]) > MOST_HOLES:
+        rows.append(f"and {len(result['holes']) - MOST_HOLES} more holes: navigation/holes of the results")
     rows += report_lines(result["monitors"], result["monitor_totals"])
     if result["steering"]:
         rows.append(_steering_text(result["steering"]))

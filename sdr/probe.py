@@ -14,7 +14,7 @@ import numpy as np
 from sdr import guess, iffile
 from signals.constants import CYCLES_PER_CHIP, F_L1_HZ
 from signals.modulation import SIGNALS
-from tracking.acquisition import AcquisitionSpec, acquire
+from tracking.acquisition import AcquisitionSpec, acquire, lowest_rate_hz
 
 if TYPE_CHECKING:
     from sdr.__main__ import Recording
@@ -62,6 +62,11 @@ def _findings(declared: "iffile.Declaration") -> tuple[np.ndarray, dict[str, Any
         source.fs_hz,
         source.if_hz,
     )
+    if iq.size and np.all(iq == iq[:, :1]):
+        raise ValueError(
+            f"'{declared.data}': all samples of the first {iq.shape[1] / fs_hz:.3g} s are equal: the recorder was not"
+            " running, or this is padding (--skip-s leaves it out)"
+        )
     psd = spectrum(iq, fs_hz)
     satellites = _satellites(iq, fs_hz, if_hz)
     inverted, significance = inversion(iq, fs_hz, if_hz, satellites)
@@ -215,7 +220,8 @@ def _search(
     found = []
     for signal in signals:
         prns = spec.gps_prns if signal == "L1CA" else spec.galileo_prns
-        if window.shape[1] < 2 * fs_hz * SIGNALS[signal].code_period_s:
+        too_short = window.shape[1] < 2 * fs_hz * SIGNALS[signal].code_period_s
+        if too_short or fs_hz < lowest_rate_hz(signal):
             continue
         rows = acquire(window, 0, fs_hz, if_hz, signal, list(prns), spec)
         for row in rows[rows["acquired"]]:

@@ -19,11 +19,12 @@ from nav.navlog import Remedy
 from nav.records import SOLUTION
 from nav.steering import Sensors, Steering
 from sdr.drift import CodeDrift
+from sdr.holes import Holes
 from sdr.scenario import ReceiverSpec
 from sdr.watch.channels import Flags, Watch
 from sdr.watch.front import FrontWatch, Overheard
 from signals.modulation import SIGNALS
-from tracking.acquisition import acquire, slab_samples
+from tracking.acquisition import acquire, lowest_rate_hz, slab_samples
 from tracking.channel import STATE_IDLE, STATE_LOCKED, STATE_LOST
 from tracking.records import ACQUISITION, AIDING
 from tracking.telemetry import Telemetry
@@ -69,6 +70,8 @@ class Outcome:
     """(channel, EPOCH rows, corr (n, K)) of every channel that finished integrations."""
     observations: list[np.ndarray] = field(default_factory=list)
     solutions: list[np.ndarray] = field(default_factory=list)
+    holes: list[np.ndarray] = field(default_factory=list)
+    """HOLE rows: samples that are missing before, as the new time of a position tells."""
     views: list[np.ndarray] = field(default_factory=list)
     """VIEW rows: where the satellites of a position stood."""
     statistics: list[tuple[str, np.ndarray]] = field(default_factory=list)
@@ -92,6 +95,7 @@ class Receiver:
         self.tracker = spec.tracking.start(source.fs_hz, source.if_hz, spec.codes_path)
         self.telemetry = Telemetry(self.tracker)
         self.drift = CodeDrift(self.fs_hz)
+        self.holes = Holes(self.fs_hz)
         self.navigator = spec.navigation.start(source.fs_hz)
         self.steering = self._start_steering(sensors)
         self._aiding: np.ndarray | None = None
@@ -101,6 +105,9 @@ class Receiver:
         self.integrity = spec.integrity.start(spec.respond, self.fs_hz) if spec.integrity else None
         if self.integrity is not None:
             self.integrity.watch(self.navigator, self.steering)
+        # A rate too low for one system still serves the other.
+        systems = spec.acquisition.systems
+        self._systems = [s for s in systems if self.fs_hz >= lowest_rate_hz(SEARCHED[s])] or systems
         self.channel_of: dict[tuple[str, int], int] = {}
         self.searched: dict[str, list[int]] = {}
         self._search_spec = spec.acquisition
@@ -148,6 +155,8 @@ class Receiver:
         out.epochs = rows = [(c, epochs[c, :n], corr[c, :n]) for c, n in enumerate(counts) if n]
         for c, mine, _ in () if stops else rows:
             self.drift.hear(self.tracker.channels["signal"][c].decode(), mine)
+        if not self._steered and self.holes.hear(rows):
+            self._doubt()
         if self.integrity is not None:
             self.integrity.hear(self.channel_of, epochs, counts, self.spec.tracking)
         if n_end in stops:
@@ -163,7 +172,7 @@ class Receiver:
     def _dwell_samples(self) -> int:
         spec = self.spec.acquisition
         wanted = 0
-        for system in spec.systems:
+        for system in self._systems:
             wanted = max(wanted, slab_samples(SEARCHED[system], self.fs_hz, spec))
         return wanted
 
@@ -210,7 +219,7 @@ class Receiver:
         prns = {"G": spec.gps_prns, "E": spec.galileo_prns}
         missing = [
             (SEARCHED[system], p)
-            for system in spec.systems
+            for system in self._systems
             for p in prns[system]
             if (SEARCHED[system], p) not in self.channel_of
         ]
@@ -269,8 +278,10 @@ class Receiver:
         rows = self.transmit(sample)
         solution = self.navigator.update(
             rows, self.telemetry.ephemerides(), self.telemetry.iono_utc("G"), self.telemetry.iono_utc("E"),
-            remedy=self._remedy(sample),
+            remedy=self._remedy(sample), doubted=self.telemetry.doubted(),
         )  # fmt: skip
+        if self.navigator.late and not self.telemetry.doubted():
+            self._doubt()
         seen = self.navigator.observations
         if len(seen) and seen["sample_index"][0] == sample:
             out.observations.append(seen)
@@ -278,6 +289,10 @@ class Receiver:
                 out.views.append(self.navigator.view())
         if solution is not None and not self._steered:
             out.solutions.append(np.atleast_1d(np.asarray(solution, SOLUTION)))
+            if solution["valid"]:
+                out.holes.append(self.holes.fix(solution))
+        if not self.telemetry.doubted():
+            self.holes.settle()
         if self.integrity is not None:
             # What it asks for holds from the next epoch on: the hand-over to navigation, one epoch later.
             out.integrity.append(self.integrity(sample))
@@ -322,6 +337,11 @@ class Receiver:
     def _steered(self) -> bool:
         """Whether a filter steers the channels now."""
         return self.steering is not None and self.steering.filter is not None
+
+    def _doubt(self) -> None:
+        """Samples may be missing: transmit times wait for the messages to confirm them."""
+        self._decode()
+        self.telemetry.doubt()
 
     def _decode(self) -> None:
         self.telemetry.decode()
@@ -398,6 +418,7 @@ class Receiver:
             self.integrity.gather(steering)
         if self._steered and self._week is not None and steering.due(SOLUTION_S):
             out.solutions.append(steering.solution(self._week))
+            out.holes.append(self.holes.fix(out.solutions[-1][0]))
         if self._steered and steering.due(TAKE_S):
             steering.meet(self.navigator.handover()[2])
             steering.take(self._phase_locked(sample), self.telemetry.ephemerides())

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import resource
 import signal
 import subprocess
@@ -81,6 +82,9 @@ def test_no_satellite_says_what_was_searched(noise, tmp_path):
         (["receive", "NOISE", "--format", "ci8", "--fs-hz", "4e6", "--if-hz", "3e6"], ["3"]),
         (["receive", "NOISE", "--format", "ci8", "--fs-hz", "4e6", "--skip-s", "9"], ["0.3"]),
         (["receive", "NAN", "--format", "cf32", "--fs-hz", "4e6"], ["1234"]),
+        (["receive", "NOISE", "--format", "ci8", "--fs-hz", "1e15"], ["1e+15"]),
+        (["receive", "NOISE", "--format", "ci8", "--fs-hz", "4e6", "--threads", "0"], ["threads", "0"]),
+        (["probe", "FLAT", "--format", "ci8", "--fs-hz", "4e6"], ["equal"]),
         (["plot", "NOISE"], ["HDF5"]),
         (["lines", "--signal", "L5"], ["L5", "L1CA"]),
         (["acquire", "NOISE", "--format", "ci8", "--fs-hz", "4e6", "--p-fa", "2"], ["p_fa"]),
@@ -93,11 +97,13 @@ def test_bad_input_is_one_sentence(args, words, noise, tmp_path):
     samples = np.ones(400_000, np.float32)
     samples[2 * 1234] = np.nan
     (tmp_path / "nan.bin").write_bytes(samples.tobytes())
+    (tmp_path / "flat.bin").write_bytes(b"\7" * 400_000)
     names = {
         "NOISE": noise,
         "EMPTY": tmp_path / "empty.bin",
         "ODD": tmp_path / "odd.bin",
         "NAN": tmp_path / "nan.bin",
+        "FLAT": tmp_path / "flat.bin",
     }
     done = gnssbb(*[names.get(a, a) for a in args], cwd=tmp_path)
     assert done.returncode == 2, done.stderr
@@ -106,6 +112,24 @@ def test_bad_input_is_one_sentence(args, words, noise, tmp_path):
     assert len(done.stderr.strip().splitlines()) == 1, done.stderr
     for word in words:
         assert word in done.stderr, done.stderr
+
+
+def test_no_fix_under_a_tone_says_where_it_is_and_what_to_do(tmp_path):
+    """300 kHz falls into a bin of 4 MHz / 512 = 7.8 kHz; J/N is J/N0 less 66 dB of 4 MHz."""
+    tone = 'jammer=[{kind="CW", freq_hz=300e3, jn0_dbhz=86.0}]'
+    done = gnssbb("run", "demo", "-o", tmp_path / "a.h5", "--json", *SHORT, "--set", tone)
+    reason = json.loads(done.stdout)["no_fix_reason"]
+    words = re.search(r"narrow interference at (\S+) kHz from the carrier, (\S+) dB over", reason)
+    assert words is not None and 'kind="Notch"' in reason, reason
+    assert abs(float(words[1]) - 300.0) < 7.9 and abs(float(words[2]) - 20.0) <= 1.0
+    done = gnssbb("run", "demo", "-o", tmp_path / "a.h5", "--json", *SHORT)
+    assert "interference" not in json.loads(done.stdout)["no_fix_reason"]
+
+
+def test_a_rate_too_low_for_galileo_still_finds_gps(noise, tmp_path):
+    done = gnssbb("receive", noise, "--format", "ci8", "--fs-hz", "2e6", "-o", tmp_path / "a.h5", "--json")
+    reason = json.loads(done.stdout)["no_fix_reason"]
+    assert "L1CA PRN 1-32" in reason and "E1C" not in reason
 
 
 def _hear_interrupts():

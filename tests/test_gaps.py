@@ -1,8 +1,10 @@
-"""Samples that are missing in the middle of a recording: the receiver's time must not stay off."""
+"""Samples that are missing in the middle of a recording: time comes right again, the hole is told, no fix is wrong."""
 
 import numpy as np
 import pytest
 
+from nav import pvt
+from nav.records import SATELLITE
 from sdr import scenario
 from sdr.receiver import Receiver
 
@@ -31,18 +33,18 @@ class Dropping:
 
 
 @pytest.mark.parametrize(
-    "system, gap_s",
-    # Less than a bit, a whole bit, and both; part of a code period, and a whole CS25_1.
-    [("G", 1e-3), ("G", 20e-3), ("G", 137e-3), ("E", 7e-3), ("E", 100e-3)],
+    "system, gap_s, n_satellites",
+    # Less than a bit, a whole bit, and both; part of a code period, and a whole CS25_1; nothing to test the ranges with.
+    [("G", 1e-3, 6), ("G", 20e-3, 6), ("G", 137e-3, 6), ("G", 20e-3, 4), ("E", 7e-3, 6), ("E", 100e-3, 6)],
 )
-def test_time_is_right_again_after_a_gap(system, gap_s):
+def test_a_gap_is_told_and_no_position_is_wrong(system, gap_s, n_satellites):
     """Lost channels are back within 2 s, bit edges are compared every 2 s; then comes a header (6 s) or time word (10 s)."""
     right_s = {"G": 11.0, "E": 14.0}[system]
     over = [
         f"front_end.fs_hz={FS_HZ}",
         "sky.start=2024-03-01T12:00:58",  # an ephemeris begins within 2 s
         f"duration_s={GAP_AT_S[system] + right_s + 4.0}",
-        "sky.max_satellites=6",
+        f"sky.max_satellites={n_satellites}",
         f'sky.signals=["{"L1CA" if system == "G" else "E1"}"]',
         f'receiver.acquisition.systems=["{system}"]',
         "clock={bias_s=2e-4, drift_s_s=3e-7}",
@@ -51,7 +53,8 @@ def test_time_is_right_again_after_a_gap(system, gap_s):
     source = scenario.source(spec)
     at, n = round(GAP_AT_S[system] * FS_HZ), round(gap_s * FS_HZ)
     receiver = Receiver(spec.receiver, Dropping(source, at, n))
-    rows = np.concatenate([s for outcome in receiver for s in outcome.solutions])
+    outcomes = list(receiver)
+    rows = np.concatenate([s for outcome in outcomes for s in outcome.solutions])
     t_s = (rows["sample_index"] + np.where(rows["sample_index"] > at, n, 0)) / FS_HZ
     true = source.sky.receiver(t_s)
     late_s = rows["tow_s"] - (source.sky.tow_s + t_s - true["clock_bias_s"])
@@ -60,5 +63,39 @@ def test_time_is_right_again_after_a_gap(system, gap_s):
     # A Galileo receiver alone keeps Galileo's time, which GGTO (below 20 ns) parts from GPS time.
     assert np.all(np.abs(late_s[before | after]) < 1e-7)
     error_m = np.linalg.norm(rows["pos_ecef_m"] - true["pos_ecef_m"], axis=1)
-    # Six satellites whose smoothing began a few seconds ago.
-    assert np.all(error_m[before | after] < 8.0)
+    # Few satellites whose smoothing began a few seconds ago; a time error of a millisecond moves them by 0.8 m.
+    assert np.all(error_m < (8.0 if n_satellites == 6 else 30.0))
+    # Positions hold a range to metres, and the disturbance shows in the integration of 20 ms that holds it or the next.
+    (hole,) = np.concatenate([h for outcome in outcomes for h in outcome.holes])
+    assert abs(hole["missing_s"] - gap_s) < 1e-7
+    assert abs(hole["t_s"] - GAP_AT_S[system]) < 0.045
+    assert GAP_AT_S[system] < hole["seen_s"] < GAP_AT_S[system] + right_s
+
+
+def test_a_common_error_of_time_is_told_from_one_wrong_range():
+    """Eight satellites, ranges of 1 m noise: 40 ms late on all is one unknown, 60 m on one is not."""
+    rng = np.random.default_rng(5)
+    sats, n = np.zeros(8, SATELLITE), 8
+    los = rng.standard_normal((n, 3))
+    los[:, 2] = np.abs(los[:, 2])
+    los /= np.linalg.norm(los, axis=1, keepdims=True)
+    sats["vel_ecef_mps"] = 3000.0 * rng.standard_normal((n, 3)) / np.sqrt(3)
+    slide = np.einsum("ij,ij->i", los, sats["vel_ecef_mps"])
+    h = np.column_stack([-los, np.ones(n)])
+    state = np.array([30.0, -20.0, 10.0, 1e3])
+    noise, one = rng.standard_normal(n), np.eye(n)[3]
+    args = sats, los, np.ones(n), np.zeros(n), np.ones(n, np.uint8)
+    for tau_s, wrong_m in ((0.0, 0.0), (40e-3, 0.0), (0.0, 60.0)):
+        y = h @ state + slide * tau_s + wrong_m * one + noise
+        estimate_s, sigma_s, chi2, rest, without = pvt.time_error(*args, y, 4)
+        assert wrong_m or abs(estimate_s - tau_s) < 5 * sigma_s
+        full = np.column_stack([h, slide])
+        fit = [float(np.sum((y - m @ np.linalg.lstsq(m, y)[0]) ** 2)) for m in (h, full)]
+        seven, ranges = np.delete(h, 3, 0), np.delete(y, 3)
+        left_out = float(np.sum((ranges - seven @ np.linalg.lstsq(seven, ranges)[0]) ** 2))
+        assert np.allclose([chi2, rest], fit) and without <= left_out * (1 + 1e-6)
+        if tau_s:
+            with pytest.raises(pvt.Late, match="40 ± "):
+                pvt.refuse_late(*args, y, 4, 1e-5, False)
+        else:
+            pvt.refuse_late(*args, y, 4, 1e-5, False)

@@ -124,9 +124,14 @@ class _Plan(NamedTuple):
         return self.hop * self.blocks + self.n * (self.pad - 1)
 
 
+def lowest_rate_hz(signal):
+    """Sample rate below which a signal is not searched: its chips, or the half chips of a BOC."""
+    return CHIP_RATE_HZ * (1 if signal == "L1CA" else 2)
+
+
 def working_rate(signal, fs_hz):
     """Rate of the search: the input's own if it is low and FFT-friendly, else near 4 Msps, never far above it."""
-    lowest = CHIP_RATE_HZ * (1 if signal == "L1CA" else 2)
+    lowest = lowest_rate_hz(signal)
     if not (math.isfinite(fs_hz) and fs_hz >= lowest):
         raise ValueError(f"fs_hz = {fs_hz:g} cannot carry {signal}: at least {lowest:g} is needed")
     period_s = SIGNALS[signal].code_period_s
