@@ -103,7 +103,8 @@ def ecef17_f(pos_ecef_m, c_be, specific_force_body_mps2, accel_rate, gyro_rate, 
 class Ecef17(BaseModel):
     """17 states in ECEF: dp dv psi dba dbg b d (Abdel-Hafez, both papers, equations 1-3 linearised).
 
-    The noise strengths are not in the seeds; the defaults are a tactical-grade IMU and a TCXO-like clock.
+    The noise strengths are not in the papers; the defaults are a tactical-grade IMU and a TCXO-like clock. Scale factors and
+    misalignments have no states: while the body manoeuvres the biases take them in (``ultratight_kernels.predict``).
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -114,6 +115,8 @@ class Ecef17(BaseModel):
     gyro_bias_walk_rad_s_rts: float = Field(1e-7, ge=0, le=1)
     accel_bias_tau_s: float = Field(float("inf"), gt=0)
     gyro_bias_tau_s: float = Field(float("inf"), gt=0)
+    scale_sigma: float = Field(0.0, ge=0, le=0.1)
+    misalignment_sigma_rad: float = Field(0.0, ge=0, le=0.1)
     clock_phase_noise_m2_s: float = Field(0.009, ge=0, le=1e6)
     clock_freq_noise_m2_s3: float = Field(0.035, ge=0, le=1e6)
 
@@ -215,7 +218,7 @@ def pinson13_f(c_en, radii_m, v, force_n, baro_rate, baro_gain, damped, coupling
 
     ``radii_m`` (R_M + h, R_N + h); ``v``, ``force_n`` (3,) velocity and specific force in the navigation frame; ``damped`` 1 or 0 times -gain on the height,
     ``coupling`` +-1 times gain from the barometer's error to it. The change of rho with height, V/R^2 dh, is left out as in
-    the seed.
+    the thesis.
     """
     crx, cry = 1.0 / radii_m[1], 1.0 / radii_m[0]
     omega, both, d_rho = np.empty(3), np.empty(3), np.zeros((3, 3))
@@ -248,14 +251,14 @@ def pinson13_f(c_en, radii_m, v, force_n, baro_rate, baro_gain, damped, coupling
 class Pinson13(BaseModel):
     """13 states of Vanek 1999 (eq. 42, appendix A): dtheta(3) phi(3) dV(3) dh dhB b d, in SI units.
 
-    Signs. ``form="feedforward"`` is the seed's: INS error = INS - true, clock and barometer errors as they are, range
+    Signs. ``form="feedforward"`` is the thesis's: INS error = INS - true, clock and barometer errors as they are, range
     row +u (eq. 51), barometer row [dh - dhB] for h_INS - h_baro (eq. 46). ``form="feedback"`` is the project's
     dx = true - estimate; the inertial block of F is the same (it is homogeneous), the barometer coupling changes sign.
 
-    ``printed_baro=True`` keeps F44 = [[0, k2], [k1, -beta]] of the seed, in which nothing pulls the height back; the
+    ``printed_baro=True`` keeps F44 = [[0, k2], [k1, -beta]] of the thesis, in which nothing pulls the height back; the
     default has -k2 on the height, as a vertical channel slaved to the barometer must.
 
-    The seed's PSD units "deg^2/sec^3", "ft^2/sec^3", "ft^2/sec^5" are one or two powers of a second too many; the
+    The thesis's PSD units "deg^2/sec^3", "ft^2/sec^3", "ft^2/sec^5" are one or two powers of a second too many; the
     defaults are its numbers read as deg^2/s, ft^2/s and ft^2/s^3 (Qa, ft^2/s^3, is right as printed), in SI.
     """
 

@@ -183,7 +183,7 @@ def ecef17_of(imu: ImuSpec, **other) -> Ecef17:
 
     Gauss-Markov biases: driving noise sqrt(2/tau) sigma. With a turn-on bias beside it the sum neither
     decays nor forgets, so it is modelled as a random walk of that noise and its turn-on size belongs in
-    P0. Scale factor and misalignment have no state: enlarge the noise where they matter.
+    P0. Scale factor and misalignment go with them.
     """
     values = {
         "accel_noise_mps2_rthz": imu.accel_noise_si,
@@ -192,6 +192,8 @@ def ecef17_of(imu: ImuSpec, **other) -> Ecef17:
         "gyro_bias_walk_rad_s_rts": math.sqrt(2.0 / imu.gyro_tau_s) * imu.gyro_bias_si[1],
         "accel_bias_tau_s": imu.accel_tau_s if imu.accel_bias_mg == 0.0 else math.inf,
         "gyro_bias_tau_s": imu.gyro_tau_s if imu.gyro_bias_deg_h == 0.0 else math.inf,
+        "scale_sigma": imu.scale_ppm * 1e-6,
+        "misalignment_sigma_rad": imu.misalignment_mrad * 1e-3,
     }
     return Ecef17(**(values | other))
 

@@ -162,8 +162,8 @@ BLOCK_S, EXCITED_MPS2, SURE = 1.0, 0.15, 0.1
 standard error is larger."""
 
 
-def check_axes(force_mps2, turn_rad_s, speed_mps, dt_s):
-    """Whether the accelerometer's x and y are forward and right, by the odometer and the turn rate about down.
+def check_axes(force_mps2, turn_rad_s, speed_mps, dt_s, witness="the odometer"):
+    """Whether the accelerometer's x and y are forward and right, by the speed that ``witness`` tells and the turn rate about down.
 
     On level ground f_x = dv/dt and f_y = v w. Each of the two that the drive excites is looked for in both axes by least
     squares: c = cov(move, axis) / var(move), 1 in its own and 0 in the other.
@@ -201,12 +201,12 @@ def check_axes(force_mps2, turn_rad_s, speed_mps, dt_s):
         axis, wanted = "xy"[k], ("forward", "right")[k]
         if abs(own) < 0.5 < abs(other):
             raise ValueError(
-                f"what the odometer says of {name} stands in accel_{'yx'[k]} ({other:.2f} of it) and not in accel_{axis} "
+                f"what {witness} says of {name} stands in accel_{'yx'[k]} ({other:.2f} of it) and not in accel_{axis} "
                 f"({own:.2f}): x and y are exchanged; the axes must be forward, right, down."
             )
         if own < -0.5:
             raise ValueError(
-                f"accel_{axis} says the opposite of what the odometer says of {name} ({own:.2f} of it): it must point {wanted}."
+                f"accel_{axis} says the opposite of what {witness} says of {name} ({own:.2f} of it): it must point {wanted}."
             )
         said = "not confirmed" if own < 0.5 or said == "not confirmed" else "as they should be"
     return said

@@ -49,6 +49,8 @@ ISB_SIGMA_M = 5.0
 """Of an inter-system bias that a scalar fix gave."""
 REPORT_S = 0.1
 """Between new values of the slower columns of ``Steering.record``."""
+AXES_S, AXES_ROWS = 10.0, 3000
+"""Without an odometer the IMU's axes are held against the satellites this often, over so many rows of ``REPORT_S``."""
 REFRESH_S = 1.0
 """Atmosphere and ephemerides are renewed this often."""
 MISSING_S = 5.0
@@ -115,6 +117,7 @@ class Steering:
         self._table = np.zeros((0, kernels.N_SENSOR))
         self._sensor_sample: list[int] = []
         self.axes = "not observable"
+        self._moves: list[tuple[float, ...]] = []
         if spec.mode == "ultra_tight":
             self._read_sensors()
         self._tables = np.stack(
@@ -224,11 +227,11 @@ class Steering:
         imu = self.sensors.imu_spec if self.sensors else None
         p = start_covariance(
             self.model, x, pos_m=self.spec.range_sigma_m, vel_mps=0.2, bias_m=2.0 * self.spec.range_sigma_m, drift_mps=0.3,
-            heading_rad=min(0.01 + 0.25 / max(moving, 1.0), 0.3), imu=imu,
+            heading_rad=min(0.01 + 0.25 / max(moving, 1.0), 0.3), imu=imu, fix_m2=np.array(solution["cov_ecef_m2"]),
         )  # fmt: skip
         barometer = self.sensors.barometer_spec if self.sensors else None
         self.filter = Filter(self.spec, self.model, x, p, SLOTS, self.log_length, barometer)
-        self._estimate_isb = False
+        self._estimate_isb, self._moves = False, []
 
     def meet(self, isb_m: float | None) -> None:
         """Learn Galileo's clock minus GPS's from the position stage; until then only the first system is steered."""
@@ -379,6 +382,7 @@ class Steering:
             self.refresh(ephemerides())
         commands = np.zeros(len(channels_state), AIDING)
         nis, rows, surprise = self._step(sample, epochs, counts, commands)
+        self._watch_axes(sample)
         self._judge(sample, surprise, rows)
         self._report(sample, nis, rows)
         if self.state == LOST:
@@ -442,7 +446,29 @@ class Steering:
         elif usable >= self.spec.min_satellites and self._ratio > INCONSISTENT_RATIO:
             why = f"innovations are {self._ratio:.1f} times what the filter expects"
         if why:
+            self._check_axes()
             self.release(why)
+
+    def _watch_axes(self, sample):
+        """Without an odometer a car's speed is that which satellites give; kept while enough of them are heard."""
+        if self.sensors is None or self.sensors.odometer is not None or not self.due(REPORT_S):
+            return
+        if self.sensors.imu_spec.attitude != "land":
+            return
+        if self.usable < self.spec.min_satellites:
+            self._moves.clear()
+            return
+        last = bisect_right(self._sensor_sample, sample + 1)
+        mean = self._table[max(last - round(REPORT_S / self.dt_s), 0) : last].mean(axis=0)
+        speed = float(np.linalg.norm(self.filter.position()[1]))
+        self._moves = [*self._moves[1 - AXES_ROWS :], (mean[3], mean[4], mean[2], speed)]
+        if self.due(AXES_S):
+            self._check_axes()
+
+    def _check_axes(self):
+        if self._moves:
+            m = np.array(self._moves)
+            self.axes = check_axes(m[:, :2], m[:, 2], m[:, 3], REPORT_S, "the satellites' Doppler")
 
     def due(self, every_s: float) -> bool:
         """Whether this epoch is one of those ``every_s`` apart."""
@@ -451,7 +477,7 @@ class Steering:
     def summary(self) -> dict[str, Any]:
         """How it went: from when on, for how long with and without satellites, how often it let go and why the last time.
 
-        ``axes``: what the odometer says of the IMU's, see ``sensor_files.check_axes``.
+        ``axes``: what the odometer, or the satellites' Doppler, says of the IMU's, see ``sensor_files.check_axes``.
         """
         return {
             "mode": self.spec.mode, "model": self.model.kind, "first_s": self._began_s,

@@ -52,8 +52,11 @@ ECEF17, KINEMATIC, PINSON = 2, 3, 4
 BARO_ERROR, WANDER, BARO_HEIGHT = 23, 24, 25
 """Columns of the Pinson model, whose others are those of ``ECEF17``: error of the barometer (m), angle of the navigation frame
 about up, from east and north (rad), and the last height read (m, NaN: none)."""
-N_X, ACC, ISB = 32, 27, 30
-"""Length of the nominal state; ECEF acceleration (3) of the last prediction; inter-system bias, m."""
+N_X, ACC, ISB, USUAL = 37, 27, 30, 31
+"""Length of the nominal state; ECEF acceleration (3) of the last prediction; inter-system bias, m; of ``ECEF17`` the low-passed
+angular rate (3) and specific force (3) of the body (NaN: none yet)."""
+MANOEUVRE_S = 5.0
+"""Correlation time of rates and specific forces in manoeuvres, and that of their low pass: assumed."""
 
 LEFT_OUT = 1e12
 """Factor on the variances of a satellite that a monitor excludes: it weighs nothing and is still steered."""
@@ -71,6 +74,8 @@ OBSERVED_HZ = 1.0
 """Bandwidth in which ranges and rates are smoothed for observations: that of a scalar receiver's code loop."""
 STRONG = 10.0
 """C/N0 T above which the signal's own power is learnt."""
+CHANGED = 3.0
+"""Standard deviations of a mean of prompt powers beyond which the signal is another than before."""
 
 TABLE_LOW_DB, TABLE_STEP_DB = -20.0, 0.5
 """Grid of the discriminator table: C/N0 T in dB; columns code gain, code variance (chips^2), frequency gain and
@@ -262,7 +267,8 @@ def predict(model, x, p, sensors, dt_s, filter_s, rates, q_diag, f, phi, qd):
     ----------
     x (N_X,), p (n, n) : in place;  sensors (m, N_SENSOR);  dt_s : one sensor interval
     filter_s : pitch low pass of RISS;  q_diag (n,)
-    rates (3,) : 1 / correlation times of the model, 1/s; of PINSON the barometer's, its loop's gain 1/s, its variance m^2
+    rates (4,) : 1 / correlation times of the model, 1/s; of PINSON the barometer's, its loop's gain 1/s, its variance m^2; of ECEF17
+        beside two of them variances of scale factor and of misalignment
     f, phi, qd (n, n) : work and outputs
     """
     m, n = sensors.shape[0], p.shape[0]
@@ -283,6 +289,7 @@ def predict(model, x, p, sensors, dt_s, filter_s, rates, q_diag, f, phi, qd):
     elif model == ECEF17:
         middle, force = _strapdown_epoch(x, sensors, dt_s, rates)
         ecef17_f(x[0:3], middle, force, rates[0], rates[1], f[: n - 1, : n - 1])
+        q_diag = _manoeuvre_noise(x, sensors, span, rates[2], rates[3], q_diag)
     elif model == PINSON:
         _pinson_epoch(x, sensors, dt_s, rates, f[: n - 1, : n - 1])
     else:
@@ -298,6 +305,32 @@ def predict(model, x, p, sensors, dt_s, filter_s, rates, q_diag, f, phi, qd):
     position_velocity(model, x, pos, v1)
     for i in range(3):
         x[ACC + i] = (v1[i] - v0[i]) / span
+
+
+@njit(cache=True, nogil=True)
+def _manoeuvre_noise(x, sensors, span, scale_var, misalignment_var, q_diag):
+    """Qc of this epoch: what scale factors and misalignments make of the biases while the body's rate and specific force change.
+
+    What acts as a bias is b + M f, M a constant of the run. Of it M f- with the low-passed f- is the bias state's; the rest M f~ is
+    taken as Gauss-Markov of variance sum_j E[M_ij^2] f~_j^2 and correlation time ``MANOEUVRE_S``: driving noise 2 / tau times
+    that, on the bias state itself, which keeps it correlated. Steady motion adds nothing.
+    """
+    q = q_diag.copy()
+    k = span / (MANOEUVRE_S + span)
+    squares = np.empty(3)
+    for triad in range(2):
+        total = 0.0
+        for i in range(3):
+            at, mean = USUAL + 3 * triad + i, 0.0
+            for s in range(sensors.shape[0]):
+                mean += sensors[s, 3 * triad + i] / sensors.shape[0]
+            x[at] = mean if math.isnan(x[at]) else x[at] + k * (mean - x[at])
+            squares[i] = (mean - x[at]) ** 2
+            total += squares[i]
+        for i in range(3):
+            var = scale_var * squares[i] + misalignment_var * (total - squares[i])
+            q[(12 if triad == 0 else 9) + i] += 2.0 / MANOEUVRE_S * var
+    return q
 
 
 @njit(cache=True, nogil=True)
@@ -390,25 +423,42 @@ def look_up(table, snr, out):
 
 
 @njit(cache=True, nogil=True)
+def scatter(prompt, noise, weight):
+    """Standard deviation of an exponential mean of |P|^2, one step counting ``weight`` k, from prompt and noise powers.
+
+    |P|^2 of a signal S in noise N has variance N^2 + 2 S N; its mean k / (2 - k) of that.
+    """
+    return math.sqrt(weight / (2.0 - weight) * noise * max(2.0 * prompt - noise, noise))
+
+
+@njit(cache=True, nogil=True)
 def watch_power(row, prompt_power, noise_power, span_s, fast_s, slow_s):
-    """Fast and slow means of |P|^2 and of the noise tap's power, each per integration of the same length."""
+    """Fast and slow means of |P|^2 and of the noise tap's power, each per integration of the same length.
+
+    The slow mean begins anew from the fast one that lies below it by more than scatter: a fall is followed in ``fast_s``, what
+    lasts is known from ``slow_s``, and there is no bias as of the lower of two.
+    """
     w = row[WEIGHT] + span_s
-    kf, ks = span_s / min(w, fast_s + span_s), span_s / min(w, slow_s + span_s)
     if prompt_power < 0.1 * row[P_FAST] and row[P_FAST] > STRONG * row[N_FAST]:
-        row[P_FAST] = prompt_power  # a strong signal that is gone is gone at once
+        row[P_FAST] = row[P_SLOW] = prompt_power  # a strong signal that is gone is gone at once
+        w = 2.0 * span_s
+    kf, ks = span_s / min(w, fast_s + span_s), span_s / min(w, slow_s + span_s)
     row[P_FAST] += kf * (prompt_power - row[P_FAST])
     row[P_SLOW] += ks * (prompt_power - row[P_SLOW])
     row[N_FAST] += kf * (noise_power - row[N_FAST])
+    if row[P_SLOW] - row[P_FAST] > CHANGED * scatter(row[P_SLOW], row[N_FAST], kf):
+        row[P_SLOW], w = row[P_FAST], min(w, fast_s)
     row[WEIGHT] = min(w, 1e3)
 
 
 @njit(cache=True, nogil=True)
-def cn0_from_powers(power, active, span_s, cn0_out):
-    """C/N0 (Hz) of every channel from the fast means, as pessimistic as fast and slow, own and common noise allow.
+def cn0_from_powers(power, active, span_s, slow_s, cn0_out):
+    """C/N0 (Hz) of every channel.
 
-    C/N0 = (min(P_fast, P_slow) - N) / (N T), N the median of all channels' noise, or the own one where it is twice
-    that: a jammer that rises is in the common noise at once, one that hits a single code in its own. Never more than the
-    remembered signal power allows.
+    C/N0 = (P_slow - N) / (N T), N the median of all channels' fast noise, or the own one where it is twice
+    that: a jammer that rises is in the common noise at once, one that hits a single code in its own. Once the signal's own
+    power S is known from when it was strong, S / (N T) while P_slow is S + N within scatter: among noise an estimate of its
+    own would scatter to gains and weights that are not there. Never more than S allows.
     """
     n = power.shape[0]
     noise = np.empty(n)
@@ -426,17 +476,23 @@ def cn0_from_powers(power, active, span_s, cn0_out):
             continue
         own = power[c, N_FAST] * span_s[c]
         density = own if own > 2.0 * common else common
-        prompt = min(power[c, P_FAST], power[c, P_SLOW])
+        prompt, noise_power = power[c, P_SLOW], density / span_s[c]
         value = prompt / max(density, 1e-30) - 1.0 / span_s[c]
         cn0_out[c] = max(value, 0.5)
         if value * span_s[c] > STRONG and power[c, WEIGHT] > 0.2:
             k = 1.0 if power[c, SIGNAL] == 0.0 else 0.01
-            power[c, SIGNAL] += k * (prompt - density / span_s[c] - power[c, SIGNAL])
+            power[c, SIGNAL] += k * (prompt - noise_power - power[c, SIGNAL])
         elif power[c, SIGNAL] > 0.0:
-            # Among noise the estimate scatters upwards to gains and weights that are not there: a signal gets no stronger.
-            cn0_out[c] = min(cn0_out[c], power[c, SIGNAL] / density)
-            if power[c, SIGNAL] * span_s[c] > STRONG * density and value * span_s[c] < 1.0:
-                cn0_out[c] = 0.5  # it should stand out and does not: what is left is noise alone
+            there, weight = (
+                power[c, SIGNAL] + noise_power,
+                span_s[c] / min(power[c, WEIGHT], slow_s + span_s[c]),
+            )
+            if abs(prompt - there) < CHANGED * scatter(there, noise_power, weight):
+                cn0_out[c] = power[c, SIGNAL] / density
+            else:
+                cn0_out[c] = min(cn0_out[c], power[c, SIGNAL] / density)
+                if power[c, SIGNAL] > STRONG * noise_power and value * span_s[c] < 1.0:
+                    cn0_out[c] = 0.5  # it should stand out and does not: what is left is noise alone
         power[c, CN0_HZ] = cn0_out[c]
 
 
@@ -720,7 +776,7 @@ def navigation_epoch(model, x, p, sensors, dt_s, every_s, epoch, block, filter_s
         epochs, counts, slot, active, period_s, before, sample, fs_hz, rx_frac_s, rx_ms, rho, rate, accel, tables, which,
         power, fast_s, slow_s, code_m, rate_mps, off_m, off_mps, span_s, seen,
     )  # fmt: skip
-    cn0_from_powers(power, active, span_s, cn0)
+    cn0_from_powers(power, active, span_s, slow_s, cn0)
     h[:] = 0.0
     z[:] = 0.0
     var[:] = 1.0
@@ -734,7 +790,10 @@ def navigation_epoch(model, x, p, sensors, dt_s, every_s, epoch, block, filter_s
     if block > 1:
         prefilter(z, var, used, gain_code, gain_rate, power, epoch % block == 0)
     rows(model, x, n, los, second, gain_code, gain_rate, tp, tv, h)
+    # Discriminators speak of the middle of their integrations, which the noise of the epoch's second half has not touched.
+    p -= 0.5 * qd
     nis, n_rows = filter_update(model, x, p, h, z, var, used, power, limit, k, s, p_prior, dx)
+    p += 0.5 * qd
     before_m, before_mps = rho.copy(), rate.copy()
     pseudoranges(
         model, x, active, second, sat_pos, sat_vel, sat_acc, clock, clock_rate, delay, delay_rate, rho, rate, accel, los

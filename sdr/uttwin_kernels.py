@@ -183,7 +183,7 @@ def aided_run(rng, model, x, p, sensors, per_epoch, dt_s, filter_s, rates, q_dia
             off_m[c] = rho_nco[c] - (rho[c] - 0.5 * T * (rate[c] - 0.25 * T * accel[c]))
             off_mps[c] = rate_nco[c] - (rate[c] - 0.5 * T * accel[c])
             watch_power(power[c], meas[c, 2], meas[c, 3], T, fast_s, slow_s)
-        cn0_from_powers(power, active, span_s, cn0)
+        cn0_from_powers(power, active, span_s, slow_s, cn0)
         for c in range(count):
             seen[c] = 1 if cn0[c] >= min_cn0_hz else 0
             if fixed_hz > 0.0:
@@ -197,7 +197,9 @@ def aided_run(rng, model, x, p, sensors, per_epoch, dt_s, filter_s, rates, q_dia
                 z[c], z[count + c] = code_m[c] + off_m[c], rate_mps[c] + off_mps[c]
                 gain_code[c] = gain_rate[c] = 1.0
         rows(model, x, n, los, second, gain_code, gain_rate, tp, tv, h)
+        p -= 0.5 * qd
         nis, n_rows = filter_update(model, x, p, h, z, var, used, power, limit, k, s, p_prior, dx)
+        p += 0.5 * qd
         pseudoranges(
             model, x, active, second, sat_pos[e + 1], sat_vel[e + 1], sat_acc[e + 1], zeros, zeros, zeros, zeros, rho, rate,
             accel, los,

@@ -1,4 +1,7 @@
-"""Axes of an IMU against the odometer: exchanged or reversed ones are refused, what cannot be seen is said to be so."""
+"""Axes of an IMU against the odometer, or what satellites say of the speed: exchanged or reversed ones are refused, what cannot be seen is said to be so."""
+
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -80,3 +83,52 @@ def test_a_slope_does_not_look_like_speeding_up():
     s = sensors(TURNS)
     s.imu["accel_mps2"][3000:, 0] += 0.5
     assert said(s) == "as they should be"
+
+
+# -- without an odometer: the satellites' Doppler ---------------------------------------------------------------------
+
+
+def steered(s, speed_mps):
+    """A 17-state run that has seen a whole recording: ``speed_mps`` (0.1 s apart) is what its filter makes of the satellites."""
+    run = Steering(SteeringSpec(mode="ultra_tight", model="ecef17"), 4e6, s, SPACING)
+    run.usable = 8
+    for k, v in enumerate(speed_mps):
+        run.filter = SimpleNamespace(epochs=5 * k, position=lambda v=v: (None, np.array([v, 0.0, 0.0])))
+        run._watch_axes(round((k + 1) * 0.1 * 4e6))
+    return run
+
+
+def doppler_speeds(s):
+    return s.odometer["speed_mps"][9::10] + 0.03 * np.random.default_rng(5).standard_normal(600)
+
+
+@pytest.mark.parametrize("segments", [TURNS, SPEEDS])
+def test_satellites_show_good_axes_and_refuse_exchanged_ones(segments):
+    s = sensors(segments)
+    without = replace(s, odometer_spec=None, odometer=None)
+    assert steered(without, doppler_speeds(s)).summary()["axes"] == "as they should be"
+    s.imu["accel_mps2"][:, :2] = s.imu["accel_mps2"][:, 1::-1].copy()
+    with pytest.raises(ValueError, match=r"what the satellites' Doppler says of .*exchanged"):
+        steered(without, doppler_speeds(s))
+
+
+@pytest.mark.parametrize(("segments", "axis"), [(SPEEDS, 0), (TURNS, 1)])
+def test_satellites_refuse_axes_that_point_backwards(segments, axis):
+    s = sensors(segments)
+    s.imu["accel_mps2"][:, axis] *= -1
+    with pytest.raises(ValueError, match=f"accel_{'xy'[axis]} says the opposite of what the satellites"):
+        steered(replace(s, odometer_spec=None, odometer=None), doppler_speeds(s))
+
+
+def test_satellites_say_nothing_of_axes_on_a_straight_road_in_the_dark_or_in_the_air():
+    for segments, imu in (
+        (TURNS, ImuSpec(grade="karaim2020", attitude="aircraft")),
+        (STRAIGHT, ImuSpec(grade="karaim2020")),
+    ):
+        s = sensors(segments, imu=imu)
+        s.imu["accel_mps2"][:, :2] = s.imu["accel_mps2"][:, 1::-1].copy()
+        run = steered(replace(s, odometer_spec=None, odometer=None), doppler_speeds(s))
+        assert run.summary()["axes"] == "not observable"
+    run.usable = 3
+    run._watch_axes(4_000_000)
+    assert not run._moves

@@ -6,7 +6,7 @@ import pytest
 from nav import ultratight as ut
 from nav import ultratight_kernels as kernels
 from nav.errormodels import Ecef17, Pinson13, measurement_rows, pinson_state
-from nav.frames import geodetic_from_ecef
+from nav.frames import geodetic_from_ecef, rotation_enu_to_ecef
 from nav.imu import BarometerSpec, ImuSpec, OdometerSpec
 from nav.navlog import REMEDY, Remedy
 from nav.riss import Riss11, RissSf
@@ -269,6 +269,22 @@ def test_gains_scale_the_rows():
     assert h[0, :, [7, 8, 9]].T.tolist() == [[1, 0, 0], [1, 0, 1], [0, 2, 0], [0, 2, 0]]
 
 
+@pytest.mark.parametrize("model", MODELS, ids=lambda m: m.kind)
+def test_filter_starts_as_sure_of_its_position_as_the_fix(model):
+    x = _nominal(model)
+    pos, vel = np.empty(3), np.empty(3)
+    code = ut.model_code(model)
+    kernels.position_velocity(code, x, pos, vel)
+    axes = rotation_enu_to_ecef(*geodetic_from_ecef(pos)[:2])
+    fix = axes @ np.diag([4.0, 1.0, 25.0]) @ axes.T
+    p = start_covariance(model, x, pos_m=1.5, fix_m2=fix)
+    tp, tv = np.empty((2, 3, model.n + 1))
+    kernels.maps(code, x, tp, tv)
+    # No direction is surer than errors common to all fixes allow.
+    expected = axes @ np.diag([4.0, 1.5**2, 25.0]) @ axes.T
+    np.testing.assert_allclose(tp @ p @ tp.T, expected, atol=1e-6)
+
+
 # -- the twin ---------------------------------------------------------------------------------------------------
 
 
@@ -334,7 +350,7 @@ def test_results_depend_on_the_seed_alone(sky):
 
 
 def test_high_dynamics_hold_at_a_bandwidth_at_which_own_loops_do_not():
-    # Seeds 000 and 002: sinusoidal accelerations, here 3 to 6 g at 36 dB-Hz. A loop of 1 Hz lags by a / wn^2 = 0.27 a (m): off
+    # Abdel-Hafez, both papers: sinusoidal accelerations, here 3 to 6 g at 36 dB-Hz. A loop of 1 Hz lags by a / wn^2 = 0.27 a (m): off
     # the frequency discriminator at 60 m/s^2 swings; the filter knows the acceleration from its IMU.
     motion = HighDynamics(acc_ned_mps2=(60.0, 50.0, 30.0)).start(45.0)
     sky = Sky(45.0, motion)

@@ -25,7 +25,7 @@ def steering_with(there, n=8, mode="vector"):
     power[:, kernels.N_FAST], power[:, kernels.SIGNAL], power[:, kernels.WEIGHT] = noise, 1.0, 10.0
     power[:, kernels.P_FAST] = power[:, kernels.P_SLOW] = noise
     power[:there, kernels.P_FAST] = power[:there, kernels.P_SLOW] = 1.0 + noise
-    kernels.cn0_from_powers(run.filter.power, run.active, np.full(24, T_S), run.filter.cn0)
+    kernels.cn0_from_powers(run.filter.power, run.active, np.full(24, T_S), 1.0, run.filter.cn0)
     return run
 
 
@@ -33,14 +33,31 @@ def test_a_strong_signal_that_is_not_there_informs_nothing():
     cn0 = steering_with(2).filter.cn0
     assert cn0[:2] == pytest.approx(CN0_HZ, rel=1e-6)
     assert np.all(cn0[2:8] == 0.5)
-    # Weak signals are left as they are: under a jammer that makes 10 dB-Hz of them the estimate is what it is.
-    run = steering_with(0)
-    power = run.filter.power[:8]
-    power[:, kernels.N_FAST] = power[:, kernels.P_FAST] = power[:, kernels.P_SLOW] = 1.0 / (10.0 * T_S)
-    power[:, kernels.P_FAST] += 0.5
-    power[:, kernels.P_SLOW] += 0.5
-    kernels.cn0_from_powers(run.filter.power, run.active, np.full(24, T_S), run.filter.cn0)
-    assert run.filter.cn0[:8] == pytest.approx(5.0, rel=1e-9)
+    # Half of what is known of it, S: among 10 dB-Hz that is S itself within scatter; at 24 dB-Hz it is half of it.
+    for known_hz, seen_hz in ((10.0, 10.0), (250.0, 125.0)):
+        run = steering_with(0)
+        power = run.filter.power[:8]
+        power[:, kernels.N_FAST] = 1.0 / (known_hz * T_S)
+        power[:, kernels.P_FAST] = power[:, kernels.P_SLOW] = power[:, kernels.N_FAST] + 0.5
+        kernels.cn0_from_powers(run.filter.power, run.active, np.full(24, T_S), 1.0, run.filter.cn0)
+        assert run.filter.cn0[:8] == pytest.approx(seen_hz, rel=1e-9)
+
+
+def test_a_fall_is_followed_at_once_and_what_lasts_is_known_from_the_slow_mean():
+    rng, row = np.random.default_rng(4), np.zeros(kernels.N_CN0)
+    seen = []
+    for k in range(1500):  # S = 1 among N = 1; from 20 s on a fortieth of both, as gain control makes them
+        size = 1.0 if k < 1000 else 0.025
+        n = np.sqrt(0.5) * (rng.standard_normal(2) + 1j * rng.standard_normal(2))
+        powers = size * np.abs(np.array([1.0, 0.0]) + n) ** 2
+        kernels.watch_power(row, *powers, T_S, 0.1, 1.0)
+        seen.append(row[kernels.P_SLOW])
+    before, after = np.array(seen[200:1000]), np.array(seen[1050:1100]) / 0.025
+    # N^2 + 2 S N = 3, k = 0.02 / 1.02: sd 0.17, known from some 8 independent means of the slow one.
+    assert before.mean() == pytest.approx(2.0, abs=5 * 0.17 / np.sqrt(8))
+    assert (
+        after.max() < 2.0 + 5 * 0.51
+    )  # of the fast one: 1 s later still remembered whole by a slow mean, 40 x exp(-1)
 
 
 @pytest.mark.parametrize(
