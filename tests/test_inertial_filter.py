@@ -142,6 +142,7 @@ def test_compiled_epoch_is_the_python_one():
     n = 18  # and the inter-system bias
     x, p, sensors = np.zeros(kernels.N_X), np.diag([*p0_of(spec), 1.0]), np.zeros((2, kernels.N_SENSOR))
     x[:3], x[3:6], x[6:15], x[15:21], x[21:23] = pos, vel, c.ravel(), bias, (5.0, 0.3)
+    x[kernels.USUAL : kernels.USUAL + 6] = np.nan
     sensors[:, :3], sensors[:, 3:6] = rows["gyro_rad_s"], rows["accel_mps2"]
     expected, (f, phi, qd) = p[:17, :17].copy(), (np.zeros((n, n)) for _ in range(3))
     kernels.predict(
