@@ -178,7 +178,8 @@ def plot(
     """Draw the figures of a results file."""
     from sdr import plot as plotter
 
-    _report("plot", {"figures": [str(p) for p in plotter.plot(results, output)]}, json)
+    figures = [str(p) for p in plotter.plot(results, output)]
+    _report("plot", {"figures": figures, "text": "\n".join(figures)}, json)
 
 
 @app.command
@@ -260,13 +261,14 @@ def inject(
     *,
     recording: Recording = Recording(),
     output: Annotated[Path, Parameter(name=["--output", "-o"], help="Recording to write (base name).")],
+    plots: Annotated[bool, Parameter(negative="", help="Draw it before and after.")] = False,
     json: Json = False,
     set_: Set = [],  # noqa: B006
 ) -> None:
     """Add a scenario's jammers and echoes to a recording, at exact J/N, through gain control and quantiser."""
     from sdr import inject as injector
 
-    result = injector.inject(file, recording, scenario, output, overrides=set_, quiet=json)
+    result = injector.inject(file, recording, scenario, output, overrides=set_, plots=plots, quiet=json)
     _report("inject", result, json)
 
 

@@ -29,13 +29,14 @@ def figure(
     projection: str | None = None,
     size: tuple[float, float] = SIZE_IN,
     widths: tuple[float, ...] = (1.0,),
+    sharex: bool = True,
 ) -> Iterator[Any]:
-    """A figure of ``rows`` axes sharing x (in columns of ``widths``), saved to ``path`` on leaving."""
+    """A figure of ``rows`` axes, sharing x (in columns of ``widths``) or not, saved to ``path`` on leaving."""
     fig = canvas(size)
     axes = fig.subplots(
         rows,
         len(widths),
-        sharex="col" if rows > 1 else False,
+        sharex="col" if rows > 1 and sharex else False,
         width_ratios=widths,
         subplot_kw={"projection": projection} if projection else None,
     )

@@ -47,9 +47,10 @@ def inject(
     output: Path,
     *,
     overrides: Sequence[str] = (),
+    plots: bool = False,
     quiet: bool = False,
 ) -> dict[str, Any]:
-    """Add the jammers and echoes of scenario ``name`` to a recording -> JSON object."""
+    """Add the jammers and echoes of scenario ``name`` to a recording -> JSON object; ``plots``: and draw it."""
     spec, text = scenario.load(name, overrides)
     if not spec.jammer and spec.multipath is None:
         raise ValueError(
@@ -98,10 +99,25 @@ def inject(
             store.append("truth/echoes", echoes.truth(index, source.fs_hz))
     table = [_row(k, run, satellites, source.fs_hz) for k, run in enumerate(runs)]
     files = [str(p) for p in writer.files] + [str(truth_path)]
+    lines = [*(_line(r) for r in table), *_echo_lines(echoes)]
+    figures = [str(_draw(base, Path(files[0]), source, runs, lines, list(satellites)))] if plots else []
     return {
-        "files": files, "samples": writer.n_samples, "noise_rms_lsb": recorded.rms, "jammers": table,
-        "text": "\n".join([*(_line(r) for r in table), *_echo_lines(echoes), *(f"  {f}" for f in files)]),
+        "files": files, "samples": writer.n_samples, "noise_rms_lsb": recorded.rms, "jammers": table, "figures": figures,
+        "text": "\n".join([*lines, *(f"  {f}" for f in files + figures)]),
     }  # fmt: skip
+
+
+def _draw(
+    base: Path, written: Path, source: Any, runs: list[JammerRun], lines: list[str], names: list[str]
+) -> Path:
+    """Figure of the recording before and after, over the time in which a jammer is on."""
+    from sdr.inject_figure import injection
+
+    after = iffile.open_recording(written, iffile.declaration(written))
+    n = source.n_samples
+    on, off = [min(r.n_on, n) for r in runs] or [0], [min(r.n_off, n) for r in runs] or [n]
+    span_s = min(on) / source.fs_hz, max(off) / source.fs_hz
+    return injection(base / "injection.png", source, after, span_s, "\n".join(lines), names)
 
 
 class Recorded:

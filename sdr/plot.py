@@ -109,7 +109,7 @@ def _one_error(
             row[1].plot(label, attrs[theory], "k_", ms=12, label="thermal σ" if first else None)
     limit = 1.3 * float(np.quantile(np.abs(np.concatenate(spans)), 0.999)) if spans else 1.0
     row[0].set_ylim(-limit or -1, limit or 1)
-    row[1].set_ylim(bottom=0)
+    row[1].set_ylim(0, 1.35 * row[1].dataLim.y1 or 1)
 
 
 def _cn0(h5: h5py.File, channels: dict[str, h5py.Group], directory: Path) -> Path | None:
@@ -301,7 +301,8 @@ def _attack(h5: h5py.File, channels: dict[str, h5py.Group], directory: Path) -> 
             e, color = group["epochs"][:], f"C{k}"
             attrs = group["epochs"].attrs
             t_s = e["sample_index"] / attrs["fs_hz"]
-            axes[0].plot(t_s, e["cn0_dbhz"], lw=0.8, color=color, label=channel_name(group))
+            late = t_s > t_s[0] + 0.5  # the first estimates are of a few integrations
+            axes[0].plot(t_s[late], e["cn0_dbhz"][late], lw=0.8, color=color, label=channel_name(group))
             truth = satellite_truth(h5, b"G" if attrs["signal"] == "L1CA" else b"E", attrs["prn"])
             if len(truth) > 1:
                 errors = tracking_errors(e, truth, attrs["fs_hz"], attrs["signal"])

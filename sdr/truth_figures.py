@@ -1,5 +1,6 @@
 """Figures of what is only known of a simulation: how antenna, satellites and clock moved, and the echoes."""
 
+import tomllib
 from pathlib import Path
 
 import h5py
@@ -7,7 +8,9 @@ import numpy as np
 
 from sdr.errors import satellite_truth, tracking_errors
 from sdr.figure import channel_name, figure
+from signals.clock import G0_MPS2
 from signals.constants import C_MPS, F_L1_HZ, WAVELENGTH_M
+from signals.geodesy import ecef_to_geodetic, ned_matrix
 
 FASTEST_STANDING_MPS = 1.0
 ORBIT_MPS2 = 1.0
@@ -31,7 +34,11 @@ def motion(h5: h5py.File, channels: dict[str, h5py.Group], directory: Path) -> P
             axes[1].plot(t_s, acceleration, lw=0.9, color=f"C{k}", label=name)
             axes[2].plot(t_s, doppler_hz * 1e-3, lw=0.9, color=f"C{k}")
         clock_hz = receiver["clock_drift_s_s"] * F_L1_HZ
-        axes[3].plot(receiver["t_s"], clock_hz - clock_hz.mean(), "k", lw=0.9)
+        axes[3].plot(receiver["t_s"], clock_hz - clock_hz.mean(), "k", lw=0.9, label="all")
+        felt_hz = _felt_hz(h5, receiver)
+        if felt_hz.any():
+            axes[3].plot(receiver["t_s"], felt_hz - felt_hz.mean(), "C3--", lw=0.9, label="of acceleration")
+            axes[3].legend(fontsize=7)
         labels = (
             "antenna (m/s)",
             "away from the\nsatellite (m/s²)",
@@ -43,6 +50,15 @@ def motion(h5: h5py.File, channels: dict[str, h5py.Group], directory: Path) -> P
         axes[1].legend(ncol=8, fontsize=7)
         axes[-1].set_xlabel("time (s)")
     return path
+
+
+def _felt_hz(h5: h5py.File, receiver: np.ndarray) -> np.ndarray:
+    """What the oscillator's g-sensitivity makes of the antenna's acceleration, Hz at L1."""
+    clock = tomllib.loads(h5.attrs["scenario"]).get("clock", {})
+    lat, lon, _ = ecef_to_geodetic(receiver["pos_ecef_m"][:1])
+    axis = np.array(clock.get("g_sensitivity_ned_per_g", (0.0, 0.0, 0.0))) @ ned_matrix(lat[0], lon[0])
+    acceleration = np.gradient(receiver["vel_ecef_mps"], receiver["t_s"], axis=0)
+    return F_L1_HZ * (acceleration @ axis) / G0_MPS2
 
 
 def _by_satellite(rows: np.ndarray) -> dict[str, np.ndarray]:

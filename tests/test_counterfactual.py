@@ -2,11 +2,12 @@
 
 import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from sdr import counterfactual, iffile, inject, jobs, scenario, store, toml
+from sdr import counterfactual, iffile, inject, inject_figure, jobs, scenario, store, toml
 
 Z = 5.0
 TEXT = """
@@ -133,6 +134,23 @@ def test_injected_power_is_exact(recording, tmp_path):
     assert row["jn_db"] == pytest.approx(74.0 - 10 * math.log10(fs), abs=1e-9) and row["js_db"] is None
     (note,) = json.loads((tmp_path / "out.sigmf-meta").read_text())["annotations"]
     assert note["core:sample_start"] == 1_250_000
+
+
+@pytest.mark.parametrize("bits", [8, 2])
+def test_an_injection_is_drawn(recordings, tmp_path, bits):
+    """The correlation of 40 periods at 47 dB-Hz stands sqrt(1 + C/N0 1 ms) over its noise where the acquisition says, half a
+    sample away costs a fifth of it; J/N of 30 dB in the middle of the code's spectrum takes it below a half."""
+    text = '[[jammer]]\nkind = "Narrowband"\nbandwidth_hz = 1e6\njs_db = 47.0\nagainst = "G06"\nstart_s = 0.2'
+    recording = recordings[bits]
+    result = add(recording, tmp_path, text, plots=True)
+    assert result["figures"] == [str(tmp_path / "out" / "injection.png")]
+    assert (tmp_path / "out" / "injection.png").stat().st_size > 10_000
+    sources = [iffile.open_recording(p, iffile.declaration(p)) for p in (recording, Path(result["files"][0]))]
+    row = inject_figure._satellite(sources[0], 1_000_000, ["G06"])
+    (lags, before), (_, after) = (inject_figure._correlation(s, row, 1_000_000) for s in sources)
+    peak = math.sqrt(1.0 + 10**4.7 * 1e-3)
+    assert abs(lags[np.argmax(before)]) < 1.023 / 2.5
+    assert 0.7 * peak < before.max() < 1.1 * peak and after.max() < 0.5 * before.max()
 
 
 def test_js_against_a_satellite_has_an_interval(recording, tmp_path):
