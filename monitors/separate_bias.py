@@ -2,7 +2,7 @@
 
 The filter goes on as if there were none; the offset is estimated beside it from the filter's innovations (Friedland 1969,
 IEEE Trans. Automatic Control 14, 359-367; onset and size as in Willsky and Jones 1976, ibid. 21, 108-112). An offset a s_k
-of row i, s_k = 1 or t_k - t_o since the onset o, moves the state by a c_k and the innovations by a g_k:
+of row i, s_k = 1 or t_k - t_o since the onset o (until it may end, when it stays), moves the state by a c_k and the innovations by a g_k:
 
     g_k = s_k e_i - H_k phi_k c_{k-1} ,   c_k = phi_k c_{k-1} + K_k g_k ,
     J_k = J_{k-1} + g' S^-1 g ,  b_k = b_{k-1} + g' S^-1 r ,   S^-1 = R^-1 (I - H K) ,
@@ -13,6 +13,7 @@ by their evidence, (1 + J tau^2)^-1/2 exp(b^2 / (2 (J + 1/tau^2))); the moments 
 hardly tells two satellites apart, both are corrected, each by what it may be, and the claim holds the doubt.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -27,7 +28,9 @@ RECENT, SPARSE = 50, 4
 NEGLIGIBLE = 1e-9
 """Hypotheses of less than this share of the largest weight are forgotten."""
 WORTH = 0.01
-"""Ranges of satellites of less than this weight are left as they are."""
+"""Ranges of satellites of less than this weight are left as they are, and drifts of less are not thought to end."""
+ENDS = 0.01
+"""Share of the weight of a drift that goes over, each epoch, to the one that has just ended: 20 s at 5 Hz."""
 
 
 class Posterior(NamedTuple):
@@ -47,23 +50,53 @@ class SeparateBias:
     def __init__(self, rows: ArrayLike, n: int, tau_m: float) -> None:
         self.rows, self.tau_m = np.asarray(rows), tau_m
         self._c, self._row = np.zeros((n, 0)), np.zeros(0, np.int64)
-        self._since_s, self._drifts = np.zeros(0), np.zeros(0, bool)
-        self._info, self._score = np.zeros(0), np.zeros(0)
+        self._since_s, self._until_s, self._drifts = np.zeros(0), np.zeros(0), np.zeros(0, bool)
+        self._info, self._score, self._prior = np.zeros(0), np.zeros(0), np.zeros(0)
 
     def _shape(self, t_s: float) -> np.ndarray:
-        return np.where(self._drifts, t_s - self._since_s, 1.0)
+        return np.where(self._drifts, np.minimum(t_s, self._until_s) - self._since_s, 1.0)
+
+    def _append(self, c, row, since_s, until_s, drifts, info, score, prior) -> None:
+        self._c, self._row = np.column_stack([self._c, c]), np.append(self._row, row)
+        self._since_s, self._until_s = np.append(self._since_s, since_s), np.append(self._until_s, until_s)
+        self._drifts, self._prior = np.append(self._drifts, drifts), np.append(self._prior, prior)
+        self._info, self._score = np.append(self._info, info), np.append(self._score, score)
 
     def _begin(self, since_s: float) -> None:
         """A step and a drift of every row, of an onset just after ``since_s``."""
         new = 2 * len(self.rows)
-        self._c = np.column_stack([self._c, np.zeros((len(self._c), new))])
-        self._row = np.append(self._row, np.repeat(self.rows, 2))
-        self._since_s = np.append(self._since_s, np.full(new, since_s))
-        self._drifts = np.append(self._drifts, np.arange(new) % 2 == 1)
-        self._info, self._score = np.append(self._info, np.zeros(new)), np.append(self._score, np.zeros(new))
+        zero, since = np.zeros(new), np.full(new, since_s)
+        drifts = np.arange(new) % 2 == 1
+        c = np.zeros((len(self._c), new))
+        self._append(c, np.repeat(self.rows, 2), since, zero + np.inf, drifts, zero, zero, zero)
+
+    def _end(self, t_s: float) -> None:
+        """The likeliest drift of every row may have ended at ``t_s``."""
+        _, w = self._weights()
+        going = np.where(self._drifts & np.isinf(self._until_s), w, 0.0)
+        best = [
+            k
+            for row in self.rows
+            if going[k := int(np.argmax(np.where(self._row == row, going, 0.0)))] > WORTH
+        ]
+        if best:
+            self._append(
+                self._c[:, best], self._row[best], self._since_s[best], np.full(len(best), t_s), self._drifts[best],
+                self._info[best], self._score[best], self._prior[best] + math.log(ENDS),
+            )  # fmt: skip
+
+    def _weights(self) -> tuple[np.ndarray, np.ndarray]:
+        """Precision of every hypothesis' size and its probability."""
+        sigma = np.where(self._drifts, RATE_SIGMA_MPS, self.tau_m)
+        precision = self._info + sigma**-2.0
+        log_w = self._prior + 0.5 * (self._score**2 / precision - np.log(precision * sigma**2))
+        w = np.exp(log_w - log_w.max())
+        return precision, w / w.sum()
 
     def __call__(self, e: EpochLog, r: np.ndarray, dt_s: float, onset: bool = False) -> None:
         """One epoch ``e`` of the log, ``r`` (m,) its innovations as they were without any correction, ``dt_s`` after the last."""
+        if self._row.size:
+            self._end(float(e.t_s) - dt_s)
         if onset:
             self._begin(float(e.t_s) - dt_s)
         u = np.flatnonzero(e.used)
@@ -78,12 +111,8 @@ class SeparateBias:
 
     def posterior(self, t_s: float, m: int) -> Posterior:
         """Effect of the offset on the state now, its size at ``t_s`` by each of the filter's ``m`` rows; forgets what does not count."""
-        sigma = np.where(self._drifts, RATE_SIGMA_MPS, self.tau_m)
-        precision = self._info + sigma**-2.0
+        precision, w = self._weights()
         size = self._score / precision
-        log_w = 0.5 * (self._score * size - np.log(precision * sigma**2))
-        w = np.exp(log_w - log_w.max())
-        w /= w.sum()
         each = self._c * size
         effect = each @ w
         cov = (self._c * (w / precision)) @ self._c.T + (each * w) @ each.T - np.outer(effect, effect)
@@ -98,7 +127,8 @@ class SeparateBias:
 
     def _keep(self, these: np.ndarray) -> None:
         self._c, self._row = self._c[:, these], self._row[these]
-        self._since_s, self._drifts = self._since_s[these], self._drifts[these]
+        self._since_s, self._until_s = self._since_s[these], self._until_s[these]
+        self._drifts, self._prior = self._drifts[these], self._prior[these]
         self._info, self._score = self._info[these], self._score[these]
         self.rows = np.unique(self._row)
 

@@ -76,7 +76,7 @@ def test_a_known_onset_gives_the_filter_with_one_more_state(drifts, sigma):
     for k in range(n):
         face.step(k, z[k])
         run(face.last(), face.last().r, DT_S, onset=k == onset)
-    run._keep(run._drifts == drifts)
+    run._keep((run._drifts == drifts) & np.isinf(run._until_s))
     got = run.posterior((n - 1) * DT_S, M)
     x, p, size, var, _ = augmented(z, onset, drifts, sigma)
     np.testing.assert_allclose(face.x - got.effect, x, atol=1e-9)
@@ -149,6 +149,31 @@ def fly(removal, n=200, start=60, stop=10**9, named=(80, 10**9), size_m=10.0, se
             face.filt.p += extra
             face.count, face.epochs = 0, []
     return truth - face.x, face.filt.p + extra, taken
+
+
+def test_a_drift_that_ends_is_one_offset():
+    """3 m/s for 5 s, named within, then 15 m for good: 20 flights' errors are as large as claimed, and 15 m are taken off."""
+    from scipy.stats import chi2
+
+    total, last = 0.0, []
+    for seed in range(20):
+        rng, face, removal = np.random.default_rng(seed), Face(), BiasRemoval(TAU_M, 1000)
+        truth, shift, out = np.zeros(N), dict[str, float](), None
+        for k in range(140):
+            truth = PHI @ truth + np.sqrt(np.diag(QD)) * rng.standard_normal(N)
+            z = rows(k) @ truth + np.sqrt(VAR) * rng.standard_normal(M)
+            z[ROW] += 3.0 * min(max(k - 60, 0) * DT_S, 5.0) - shift.get("C", 0.0)
+            face.step(k, z)
+            out = removal(face, None if k < 70 else "C", shift)
+            shift = out.shift
+            face.x = face.x if out.dx is None else face.x + out.dx
+        error = truth - face.x
+        total += error @ np.linalg.solve(face.filt.p + out.extra, error)
+        last.append(shift["C"])
+    low, high = chi2.isf([1 - 3e-7, 3e-7], 20 * N)
+    assert low < total < high
+    # 55 epochs of the row alone, and a third of them spent on telling the state from it.
+    assert abs(np.mean(last) - 15.0) < 5 * np.sqrt(VAR[ROW] / (20 * 55 / 3))
 
 
 def test_feeding_the_estimate_back_changes_nothing_but_the_filter():
