@@ -93,7 +93,7 @@ class NormalPoints:
         self.h, self.dx = np.zeros((m, n)), np.zeros(n)
         self._gain = np.repeat(np.array([clock, drift]), slots)
         self.epochs, self.single = 0, np.full(m, np.nan)
-        self._ring = empty_log(length, n, m)
+        self._ring = empty_log(length, n, m, covariances=False)
         self._views = epochs_of(self._ring)
         self._start: np.ndarray | None = None
         self._sums = (

@@ -35,15 +35,15 @@ class EpochLog(NamedTuple):
         return self.t_s.size
 
 
-def empty_log(n_epochs: int, n: int, m: int) -> EpochLog:
-    """An EpochLog of zeros."""
+def empty_log(n_epochs: int, n: int, m: int, covariances: bool = True) -> EpochLog:
+    """An EpochLog of zeros; without ``covariances`` of the innovations ``s`` is (E, 0, 0)."""
     shapes = {
         "phi": (n, n),
         "qd": (n, n),
         "h": (m, n),
         "k": (n, m),
         "r": (m,),
-        "s": (m, m),
+        "s": (m, m) if covariances else (0, 0),
         "var": (m,),
         "p": (n, n),
     }

@@ -57,7 +57,7 @@ def propagate(total_phi, total_qd, prior, p, dt_s, accel_psd, clock_f, clock_g, 
 @njit(cache=True, nogil=True)
 def record(
     at, los, second, innovation, variance, own, used, z, h, own_all, seen, total_phi, total_qd, prior, phi, qd, p, r_used,
-    h_used, k, s, var, took,
+    h_used, k, var, took,
 ):  # fmt: skip
     """One update into the rows of its slots ``at`` (n,), -1: none; see ``NavigatorLog.updated``. Outputs have 2S rows.
 
@@ -81,7 +81,6 @@ def record(
             if used[mine] > 0:
                 took[row], r_used[row], h_used[row] = True, z[row], h[row]
     phi[:], qd[:], p[:] = total_phi, total_qd, prior
-    eskf_kernels.innovation_covariance(prior, h_used, var, took, s)
     eskf_kernels.update(prior, h_used, var, took, r_used, k, np.empty(prior.shape[0]))
     total_phi[:], total_qd[:] = np.eye(prior.shape[0]), 0.0
 
@@ -101,7 +100,7 @@ class NavigatorLog:
 
     def _clear(self) -> None:
         n, m = kernels.N_EKF, 2 * self.slots
-        self._ring, self.count = empty_log(self.length, n, m), 0
+        self._ring, self.count = empty_log(self.length, n, m, covariances=False), 0
         self._views = epochs_of(self._ring)
         self.z, self.h, self.own = np.zeros(m), np.zeros((m, n)), np.ones(m)
         self.seen, self.dx = np.zeros(m, np.bool_), np.zeros(n)
@@ -143,15 +142,15 @@ class NavigatorLog:
         log.t_s[...] = t_s
         record(
             self._at, los, second, innovation, variance, own, used, self.z, self.h, self.own, self.seen, self._phi, self._qd,
-            self._prior, log.phi, log.qd, log.p, log.r, log.h, log.k, log.s, log.var, log.used,
+            self._prior, log.phi, log.qd, log.p, log.r, log.h, log.k, log.var, log.used,
         )  # fmt: skip
         self.dx = dx
         self.count += 1
 
     def last(self) -> EpochLog:
-        """The last epoch (views)."""
+        """The last epoch (views, ``s`` empty)."""
         return self._views[(self.count - 1) % self.length]
 
     def log(self, n_epochs: int | None = None) -> EpochLog:
-        """The last ``n_epochs`` epochs, oldest first (copies)."""
+        """The last ``n_epochs`` epochs, oldest first (copies, ``s`` left empty)."""
         return newest(self._ring, self.count, n_epochs)

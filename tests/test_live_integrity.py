@@ -116,7 +116,7 @@ def test_an_empty_remedy_is_no_remedy(sky):
 
 
 def test_log_reproduces_the_filter(sky):
-    """dx = K r of the log, and P+ = (I - K H) P, are those of the navigator's own kernel; S = H P H' + R."""
+    """dx = K r of the log, and P+ = (I - K H) P, are those of the navigator's own kernel."""
     _, _, _, _, nav = fly(sky, EKF, {"als": None}, n=40)
     log = nav.log.log(1)
     k, h, p = log.k[0], log.h[0], log.p[0]
@@ -126,8 +126,6 @@ def test_log_reproduces_the_filter(sky):
         ((np.eye(9) - k @ h) @ p) / np.outer(scale, scale), nav._p / np.outer(scale, scale), atol=1e-9
     )
     used = log.used[0]
-    want = (h @ p @ h.T + np.diag(log.var[0]))[np.ix_(used, used)]
-    np.testing.assert_allclose(log.s[0][np.ix_(used, used)], want, rtol=1e-12)
     assert used.sum() == 20 and used[:10].all() and used[nav.log.slots : nav.log.slots + 10].all()
 
 
