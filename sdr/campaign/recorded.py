@@ -24,13 +24,13 @@ from sdr.campaign.spec import (
     THRESHOLD,
     Count,
     Length,
+    Section,
     Seeds,
     StopSpec,
-    _axes,
-    _label,
-    _set,
-    _Spec,
     empty_trial,
+    grid_axes,
+    set_key,
+    setting_text,
 )
 from sdr.receiver import Receiver
 from sdr.scenario import ReceiverSpec
@@ -42,7 +42,7 @@ _WINDOW, _JAMMER, _QUANTISER = 0, 1, 2
 """Children of a trial's seed."""
 
 
-class RecordedFile(_Spec):
+class RecordedFile(Section):
     """One recording; what its metadata say needs no key."""
 
     file: str = Field(min_length=1, max_length=1000)
@@ -61,7 +61,7 @@ class RecordedFile(_Spec):
     """Use this many seconds."""
 
 
-class RecordedSpec(_Spec):
+class RecordedSpec(Section):
     """A campaign file with ``[[recordings]]`` instead of ``[twin]``."""
 
     schema_: Annotated[int, Field(alias="schema", ge=1, le=1)] = 1
@@ -127,7 +127,7 @@ class RecordedCampaign:
 
     def __init__(self, spec: RecordedSpec, text: str) -> None:
         self.spec, self.text = spec, text
-        axes = _axes(spec.grid)
+        axes = grid_axes(spec.grid)
         foreign = [p for p in axes if p.split(".")[0] != "jammer"]
         if foreign:
             raise ValueError(f"grid.{foreign[0]}: over recordings an axis starts with jammer.")
@@ -147,8 +147,8 @@ class RecordedCampaign:
         tables = json.loads(json.dumps({"jammer": self.spec.jammer}))
         for path, value in setting.items():
             if path != "recording":
-                _set(tables, path, value)
-        jammer, where = tables["jammer"], f"{self.spec.name} ({_label(setting)})"
+                set_key(tables, path, value)
+        jammer, where = tables["jammer"], f"{self.spec.name} ({setting_text(setting)})"
         if not jammer or jammer.get("kind") == "none":
             return RecordedPoint(recording, ())
         try:

@@ -10,7 +10,7 @@ import numpy as np
 from sdr.campaign.crew import each, hire
 from sdr.campaign.load import load
 from sdr.campaign.results import MASK, Results
-from sdr.campaign.spec import Campaign
+from sdr.campaign.spec import Campaign, setting_text
 from sdr.campaign.trials import evaluate_trials, fit_thresholds, quiet_statistics, warm_up
 from sdr.progress import progress
 
@@ -183,7 +183,7 @@ def _point_text(r: dict[str, Any]) -> str:
         more.append(f"per approach {r['p_fa_approach']:.2g} [{low:.2g}, {high:.2g}]")
     return (
         f"  {r['point']:4d}  {r['monitor']:16} {what:4} {rate:>9} [{r['ci_low']:.2g}, {r['ci_high']:.2g}]  {counts}{effective}, "
-        f"{r['trials']} trials ({r['stop_reason']})  " + "; ".join([_axes_text(r["axes"]), *more])
+        f"{r['trials']} trials ({r['stop_reason']})  " + "; ".join([setting_text(r["axes"]), *more])
     )
 
 
@@ -196,7 +196,7 @@ def _advantage_text(r: dict[str, Any]) -> str:
     text = f"  P_MD {r['p_md']:g} ({r['definition']}) of {r['monitor']:16} at {told(r['power_db'], r['power_ci_db'], '')} {unit}"
     if r["monitor"] != r["against"]:
         text += f"; {told(r['gain_db'], r['gain_ci_db'], '+')} dB against {r['against']}"
-    return f"{text}  {_axes_text(r['axes'])}"
+    return f"{text}  {setting_text(r['axes'])}"
 
 
 def _mask_text(r: dict[str, Any]) -> str:
@@ -213,7 +213,3 @@ def _mask_text(r: dict[str, Any]) -> str:
         f"  mask, {what}: worst at {r['worst_offset_hz'] / 1e3:g} kHz{line}; 1 dB lost from {told['loss_1db_dbw']}, lock from "
         f"{told['loss_of_lock_dbw']}, {r['monitor']} detects from {told['detected_dbw']} dBW (mask {told['mask_dbw']})"
     )
-
-
-def _axes_text(axes: dict[str, Any]) -> str:
-    return ", ".join(f"{k} = {v}" for k, v in axes.items()) or "the only point"

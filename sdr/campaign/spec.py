@@ -82,11 +82,13 @@ THRESHOLD = np.dtype(
 """Threshold of one monitor for points that differ in their jammers alone, with the training's 95 % interval."""
 
 
-class _Spec(BaseModel):
+class Section(BaseModel):
+    """A section of a campaign file."""
+
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-class Seeds(_Spec):
+class Seeds(Section):
     """Roots of the three sets of trials; they must differ."""
 
     training: int = Field(1, ge=0, lt=2**63)
@@ -103,7 +105,7 @@ class Seeds(_Spec):
         return self
 
 
-class Length(_Spec):
+class Length(Section):
     """How many trials of how many integrations."""
 
     trials: int = Field(20, ge=1, le=100_000)
@@ -112,7 +114,7 @@ class Length(_Spec):
     """Integrations per trial."""
 
 
-class TrialSpec(_Spec):
+class TrialSpec(Section):
     """One trial of the evaluation."""
 
     epochs: int = Field(25_000, ge=1, le=10_000_000)
@@ -124,7 +126,7 @@ class TrialSpec(_Spec):
     excess_m: float = Field(30.0, gt=0)  # on the raw code error, for the definitions excess and undetected
 
 
-class StopSpec(_Spec):
+class StopSpec(Section):
     """When a point is finished: whichever comes first, in trial order."""
 
     max_trials: int = Field(20, ge=1, le=10_000_000)
@@ -138,7 +140,7 @@ class StopSpec(_Spec):
     """No point ends before so many trials."""
 
 
-class MonitorSpec(_Spec):
+class MonitorSpec(Section):
     """One monitor under test and the rule for its threshold."""
 
     name: str = Field(min_length=1, max_length=16, pattern=r"^[A-Za-z0-9_.-]+$")
@@ -158,7 +160,7 @@ class MonitorSpec(_Spec):
         return self
 
 
-class Count(_Spec):
+class Count(Section):
     """Plain counting."""
 
     kind: Literal["count"] = "count"
@@ -168,7 +170,7 @@ Method = Annotated[Count | Importance | Splitting, Field(discriminator="kind")]
 """How the probability of a point is estimated: counting, or for rare ones something quicker."""
 
 
-class CampaignSpec(_Spec):
+class CampaignSpec(Section):
     """A whole campaign file."""
 
     schema_: Annotated[int, Field(alias="schema", ge=1, le=1)] = 1
@@ -250,13 +252,13 @@ class CampaignSpec(_Spec):
 # -- the grid -----------------------------------------------------------------------------------------------------
 
 
-def _axes(table: dict[str, Any], path: str = "") -> dict[str, list[Any]]:
+def grid_axes(table: dict[str, Any], path: str = "") -> dict[str, list[Any]]:
     """Dotted path -> values; nested tables are paths too."""
     axes: dict[str, list[Any]] = {}
     for key, value in table.items():
         name = f"{path}.{key}" if path else key
         if isinstance(value, dict):
-            axes |= _axes(value, name)
+            axes |= grid_axes(value, name)
         elif isinstance(value, list) and value:
             axes[name] = value
         else:
@@ -266,7 +268,8 @@ def _axes(table: dict[str, Any], path: str = "") -> dict[str, list[Any]]:
     return axes
 
 
-def _set(tables: dict[str, Any], path: str, value: Any) -> None:
+def set_key(tables: dict[str, Any], path: str, value: Any) -> None:
+    """Set the dotted key ``path`` in nested tables; ValueError where it leads through a value."""
     *parents, last = path.split(".")
     node = tables
     for part in parents:
@@ -284,7 +287,7 @@ class Campaign:
 
     def __init__(self, spec: CampaignSpec, text: str) -> None:
         self.spec, self.text = spec, text
-        self.axes = _axes(spec.grid)
+        self.axes = grid_axes(spec.grid)
         foreign = [p for p in self.axes if p.split(".")[0] not in ("twin", "jammer")]
         if foreign:
             raise ValueError(
@@ -326,8 +329,8 @@ class Campaign:
     def _twin(self, index: int, setting: dict[str, Any]) -> Twin:
         tables = json.loads(json.dumps({"twin": self.spec.twin, "jammer": self.spec.jammer}))
         for path, value in setting.items():
-            _set(tables, path, value)
-        where = f"{self.spec.name}, point {index} ({_label(setting)})"
+            set_key(tables, path, value)
+        where = f"{self.spec.name}, point {index} ({setting_text(setting)})"
         twin, jammer = tables["twin"], tables["jammer"]
         if twin.get("multipath") == "none":
             twin["multipath"] = None
@@ -379,7 +382,7 @@ class Campaign:
             key = point.model_dump_json()
             if key in seen:
                 raise ValueError(
-                    f"{spec.name}: point {i} ({_label(self.settings[i])}) repeats an earlier one"
+                    f"{spec.name}: point {i} ({setting_text(self.settings[i])}) repeats an earlier one"
                 )
             seen.add(key)
             if spec.loop == "open" and point.dynamics.model_dump() != type(point.dynamics)().model_dump():
@@ -390,7 +393,7 @@ class Campaign:
 
     def _check_rare(self, point: Twin, index: int) -> None:
         """What the quick methods cannot do."""
-        spec, where = self.spec, f"{self.spec.name}, point {index} ({_label(self.settings[index])})"
+        spec, where = self.spec, f"{self.spec.name}, point {index} ({setting_text(self.settings[index])})"
         if spec.method.kind == "count":
             return
         memory = [m.name for m in spec.monitor if getattr(m.detector, "accumulate_epochs", 2) > 1]
@@ -426,5 +429,6 @@ def empty_trial(monitors: int, point: int, trial: int) -> np.ndarray:
     return rows
 
 
-def _label(setting: dict[str, Any]) -> str:
+def setting_text(setting: dict[str, Any]) -> str:
+    """A point's place in the grid, in words."""
     return ", ".join(f"{k} = {v}" for k, v in setting.items()) or "the only point"
