@@ -123,7 +123,8 @@ def _two_bit_fields(raw: np.ndarray) -> list[str]:
 
 def _head(declared: iffile.Declaration) -> bytes:
     if not declared.data.is_file():
-        raise ValueError(f"'{declared.data}' does not exist")
+        missing = "is not a file" if declared.data.exists() else "does not exist"
+        raise ValueError(f"'{declared.data}' {missing}")
     with declared.data.open("rb") as f:
         f.seek(declared.header_bytes)
         return f.read(HEAD_BYTES)

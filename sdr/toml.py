@@ -82,12 +82,20 @@ def _sentence(model: type[BaseModel], err: ValidationError) -> str:
         text = f"'{where}' is not a known key" + (f"; allowed there: {', '.join(allowed)}" if allowed else "")
     elif first["type"] == "missing":
         text = f"'{where}' is missing; it has no default"
+    elif first["type"].startswith("union_tag"):
+        tags = first["ctx"].get("expected_tags")
+        said = f" = {first['ctx']['tag']!r} is not one of {tags}" if tags else " is missing"
+        text = f"'{where}.{first['ctx']['discriminator'].strip(chr(39))}'{said}"
     else:
         value = first.get("input")
         shown = f" = {value!r}" if isinstance(value, str | int | float | bool) else ""
         # pydantic's own messages begin with a capital; ours may begin with PLL.
         text = f"'{where}'{shown}: {message if message[:2].isupper() else message[0].lower() + message[1:]}"
-    return text + (f" (and {len(rest)} more such error{'s' * (len(rest) > 1)})" if rest else "")
+    others = list(dict.fromkeys(".".join(map(str, e["loc"])) for e in rest))
+    if not others:
+        return text
+    names = ", ".join(f"'{name}'" for name in others[:3])
+    return text + f"; then see to {names}" + (f" and {len(others) - 3} more" if len(others) > 3 else "")
 
 
 def _allowed_keys(model: type[BaseModel], loc: tuple[Any, ...]) -> list[str]:

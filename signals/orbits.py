@@ -9,6 +9,7 @@ import math
 import numpy as np
 
 from signals import inav, lnav
+from signals.almanac import elements
 from signals.constants import (
     EARTH_RATE_RAD_S,
     F_REL_GALILEO_S_SQRT_M,
@@ -24,6 +25,7 @@ from signals.timescale import week_tow
 
 __all__ = [
     "ORBIT_FIELDS",
+    "broadcast_sets",
     "check_ephemeris",
     "default_iono_utc",
     "nominal_constellation",
@@ -124,6 +126,48 @@ def quantise_ephemeris(ephemeris: np.ndarray) -> np.ndarray:
     for field in ("m0_rad", "omega0_rad", "omega_rad"):
         out[field] = np.mod(out[field] + GNSS_PI, 2.0 * GNSS_PI) - GNSS_PI
     return np.array([(lnav if e["system"] == b"G" else inav).quantised(e) for e in out], dtype=EPHEMERIS)
+
+
+# --- change-over ---------------------------------------------------------------------------------------------
+
+_CHANGE_S = {b"G": 7200, b"E": 600}
+"""New data sets go on air this often (IS-GPS-200, 20.3.4.4; Galileo sends a new batch every ten minutes or more)."""
+_LEAD_S = {b"G": 7200, b"E": 0}
+"""How long before its toe a set goes on air: GPS in the middle of its fit interval of 4 h, Galileo at toe."""
+
+
+def broadcast_sets(ephemeris: np.ndarray, week: int, tow_s: int, first_s: int, last_s: int) -> np.ndarray:
+    """Data sets that a satellite sends from ``first_s`` to ``last_s`` after the start (week, tow_s), EPHEMERIS (n,).
+
+    ``ephemeris`` until the next change-over (GPS: every even hour, Galileo: every ten minutes), then the same orbit and
+    clock at a new reference time under the next issue, so that a receiver sees a new set and no step beyond the
+    resolution of the message (some centimetres).
+    """
+    sets = [np.atleast_1d(ephemeris).copy()]
+    step_s = _CHANGE_S[bytes(ephemeris["system"])]
+    start_s = week * SECONDS_PER_WEEK + tow_s
+    begin, end = start_s // step_s, (start_s + last_s) // step_s
+    for count in range(max(begin + 1, (start_s + first_s) // step_s), end + 1):
+        moved = _moved(ephemeris, count * step_s + _LEAD_S[bytes(ephemeris["system"])])
+        modulus = 256 if moved["system"][0] == b"G" else 1024
+        moved["iode"] = (int(ephemeris["iode"]) + count - begin) % modulus
+        moved["iodc"] = int(ephemeris["iodc"]) // modulus * modulus + moved["iode"]
+        moved["tow_s"] = count * step_s % SECONDS_PER_WEEK
+        sets.append(quantise_ephemeris(moved))
+    return np.concatenate(sets)
+
+
+def _moved(ephemeris: np.ndarray, toe_abs_s: int) -> np.ndarray:
+    """The same orbit and clock with toe = toc = ``toe_abs_s``, seconds since week 0; EPHEMERIS (1,)."""
+    out = np.atleast_1d(ephemeris).copy()
+    week, toe_s = divmod(toe_abs_s, SECONDS_PER_WEEK)
+    for name, value in elements(out[0].copy(), week, toe_s).items():
+        out[name] = value
+    dt_s = toe_abs_s - int(ephemeris["week"]) * SECONDS_PER_WEEK - float(ephemeris["toc_s"])
+    out["af0_s"] += ephemeris["af2_s_s2"] * dt_s**2
+    out["af1_s_s"] += 2.0 * ephemeris["af2_s_s2"] * dt_s
+    out["week"], out["toe_s"], out["toc_s"] = week, toe_s, toe_s
+    return out
 
 
 # --- nominal constellations ------------------------------------------------------------------------------

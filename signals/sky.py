@@ -108,7 +108,8 @@ class SkySpec(BaseModel):
     source: Literal["nominal", "rinex", "none"] = "nominal"
     """Built-in nominal constellations, a RINEX navigation file, or none."""
     path: str | None = None
-    """RINEX navigation file (source "rinex")."""
+    """RINEX navigation file (source "rinex"). Of each satellite the record valid at the start counts: later data sets on
+    air are its orbit under new issues."""
     signals: tuple[Literal["L1CA", "E1"], ...] = ("L1CA", "E1")
     """Signals in the air."""
     elevation_mask_deg: float = Field(default=5.0, ge=0.0, lt=90.0)

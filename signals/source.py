@@ -19,6 +19,7 @@ from signals.kernels import COMPONENT
 from signals.lnav import encode as encode_lnav
 from signals.modulation import BLOCK, code_table
 from signals.multipath import EchoRun
+from signals.orbits import broadcast_sets
 from signals.records import ECHO_TRUTH, EPHEMERIS, FAULT_TRUTH, JAMMER_TRUTH, TRUTH
 from signals.sky import Propagation, Satellite, Sky
 from signals.synthesis_kernels import synthesise
@@ -401,9 +402,10 @@ def _messages(sky: Sky | FaultySky, satellite: Satellite, start_s: int):
         tow = sky.tow_s + start_s
         week, tow = sky.week + tow // 604_800, tow % 604_800
         iono_utc: Any = sky.iono_utc[()]  # np.void
+        sets = broadcast_sets(satellite.ephemeris, sky.week, sky.tow_s, start_s, start_s + span_s)
         messages = [
             (
-                encode(satellite.ephemeris, iono_utc, almanac, week, tow, span_s * per_s),
+                encode(sets, iono_utc, almanac, week, tow, span_s * per_s),
                 first,
                 periods,
             )

@@ -89,6 +89,12 @@ def test_no_satellite_says_what_was_searched(noise, tmp_path):
         (["lines", "--signal", "L5"], ["L5", "L1CA"]),
         (["acquire", "NOISE", "--format", "ci8", "--fs-hz", "4e6", "--p-fa", "2"], ["p_fa"]),
         (["run", "demo", "--frobnicate"], ["frobnicate"]),
+        (
+            ["run", "demo", "--set", 'jammer=[{kind="Cw"}]'],
+            ["jammer.0.kind' = 'Cw' is not one of 'CW', 'Chirp'"],
+        ),
+        (["run", "demo", "--set", "jammer=[{freq_hz=3}]"], ["jammer.0.kind' is missing"]),
+        (["run", "demo", "--set", "sky.foo=1", "--set", "duration_s=-3"], ["then see to 'sky.foo'"]),
     ],
 )
 def test_bad_input_is_one_sentence(args, words, noise, tmp_path):
