@@ -261,7 +261,7 @@ def _spectrum(h5: h5py.File, channels: dict[str, h5py.Group], directory: Path) -
     freq_mhz = ((np.arange(rows.shape[1]) / rows.shape[1] - 0.5) * attrs["fs_hz"] - attrs["if_hz"]) * 1e-6
     t_s = np.arange(len(rows)) * attrs["every_s"]
     on = np.any([(t_s >= a) & (t_s < b) for a, b in attacks(h5)] or [np.zeros(len(t_s), bool)], axis=0)
-    parts = [("without jammer", rows[~on]), ("with jammer", rows[on])]
+    parts = [("without jammer" if on.any() else "mean", rows[~on]), ("with jammer", rows[on])]
     if "mitigation/spectrum" in h5:
         cleaned = h5["mitigation/spectrum"][:]
         parts.append(("with jammer, after the mitigation", cleaned[on[: len(cleaned)]]))
