@@ -187,7 +187,8 @@ def _draw(path: Path, name: str, table: dict[str, Any], factors: Sequence[str]) 
             series = table[satellite][measure]["series"]
             for key in ["total", *factors, "interaction"]:
                 y = np.array([np.nan if v is None else v for v in series[key]])
-                ax.plot(np.arange(len(y)) * STEP_S, y, lw=0.9, label=key)
+                style = {"lw": 4.0, "color": "0.8"} if key == "total" else {"lw": 0.9}
+                ax.plot(np.arange(len(y)) * STEP_S, y, label=key, **style)
             ax.set_ylabel(label)
         axes[0].legend(fontsize=8)
         axes[-1].set_xlabel("time (s)")
