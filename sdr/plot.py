@@ -318,7 +318,7 @@ def _attack(h5: h5py.File, channels: dict[str, h5py.Group], directory: Path) -> 
             ax.set_ylabel(label)
             for begin, end in spans:
                 ax.axvspan(begin, end, color="C3", alpha=0.12, lw=0)
-        axes[0].legend(ncol=8, fontsize=7)
+        axes[0].legend(ncol=10, fontsize=7, loc="lower center", bbox_to_anchor=(0.5, 1.0))
         axes[-1].set_xlabel("time (s)")
     return path
 

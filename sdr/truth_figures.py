@@ -47,7 +47,7 @@ def motion(h5: h5py.File, channels: dict[str, h5py.Group], directory: Path) -> P
         )
         for ax, label in zip(axes, labels, strict=True):
             ax.set_ylabel(label)
-        axes[1].legend(ncol=8, fontsize=7)
+        axes[1].legend(ncol=10, fontsize=7, loc="lower center", bbox_to_anchor=(0.5, 1.0))
         axes[-1].set_xlabel("time (s)")
     return path
 
