@@ -1,4 +1,4 @@
-"""Recordings of IF samples: raw formats, SigMF and PocketSDR ``.tag`` metadata, in and out.
+"""Recordings of IF samples: raw formats, SigMF and PocketSDR ``.tag`` metadata, in and out; ION's ``.sdrx``, in.
 
 Packed samples lie least significant bits first, I before Q. Two-bit values are sign and magnitude as the MAX2771
 and PocketSDR have them (0 1 2 3 = +1 +3 -1 -3); the formats ``..tc`` are two's complement as GNSS-SDR's
@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from sdr import sdrx
 from signals.constants import F_L1_HZ
 from signals.frontend import check_sampling
 from signals.timescale import calendar
@@ -124,12 +125,15 @@ def declaration(path: Path | str, recording: Any = None) -> Declaration:
 
     Parameters
     ----------
-    path : the data, a ``.sigmf-meta``, or a SigMF base name.
+    path : the data, a ``.sigmf-meta``, a ``.sdrx``, or a SigMF base name.
     recording : anything with format, fs_hz, if_hz, conjugate, skip_s, duration_s.
     """
     path = Path(path)
     meta, tag = _meta_path(path), Path(f"{path}.tag")
-    if meta is not None:
+    if path.suffix == ".sdrx":
+        fields = sdrx.read(path, _read_text(path, _MAX_META_BYTES))
+        known = Declaration(**fields | {"start": _datetime(fields["start"])})
+    elif meta is not None:
         known = _read_sigmf(meta)
     elif tag.is_file():
         known = _read_tag(path, tag)
