@@ -26,7 +26,7 @@ from signals.multipath import EchoRun
 from tracking.acquisition import AcquisitionSpec, acquire, slab_samples
 
 if TYPE_CHECKING:
-    from sdr.__main__ import Recording
+    from sdr.options import Recording
 
 SLAB = 1 << 18
 POWER_S = 1.0

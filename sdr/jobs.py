@@ -27,7 +27,7 @@ from tracking.channel import STATE_LOCKED
 from tracking.loops import dll_jitter_chips, pll_jitter_cycles
 
 if TYPE_CHECKING:
-    from sdr.__main__ import Recording
+    from sdr.options import Recording
 
 SILENT_DB = 80.0
 """No converter's noise lies so far below a line: there is none."""

@@ -17,7 +17,7 @@ from signals.modulation import SIGNALS
 from tracking.acquisition import AcquisitionSpec, acquire, lowest_rate_hz
 
 if TYPE_CHECKING:
-    from sdr.__main__ import Recording
+    from sdr.options import Recording
 
 LOOK_S = 1.0
 SPUR_DB = 10.0

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sdr import guess, iffile, jobs, probe
-from sdr.__main__ import Recording
+from sdr.options import Recording
 
 CAPTURE = Path(__file__).resolve().parents[2] / "shared" / "data" / "real" / "L1_20211202_084700_4MHz_IQ.bin"
 N = 1 << 16

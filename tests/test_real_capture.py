@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from sdr import jobs, probe
-from sdr.__main__ import Recording
+from sdr.options import Recording
 
 CAPTURE = Path(__file__).resolve().parents[2] / "shared/data/real/L1_20211202_084700_4MHz_IQ.bin"
 pytestmark = pytest.mark.skipif(not CAPTURE.is_file(), reason=f"the capture {CAPTURE.name} is not here")

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from sdr import jobs
-from sdr.__main__ import Recording, app
+from sdr.__main__ import app
+from sdr.options import Recording
 
 SET = ["duration_s=24.0", "jammer=[]", "front_end.fs_hz=2.5e6", "sensors.barometer={}", "receiver.steering.compare=[]",
        'receiver.steering.mode="ultra_tight"', "receiver.steering.start_after_s=0.5"]  # fmt: skip
