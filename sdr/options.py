@@ -13,7 +13,9 @@ Out = Annotated[Path | None, Parameter(name=["--output", "-o"], help="Results fi
 Set = Annotated[
     list[str],
     Parameter(
-        name="--set", negative="", help="Override a scenario key, e.g. --set receiver.tracking.l1ca.dll_bw_hz=1"
+        name="--set",
+        negative="",
+        help="Override a scenario key, e.g. --set receiver.tracking.l1ca.dll_bw_hz=1",
     ),
 ]
 Threads = Annotated[int, Parameter(help="Worker threads; the results do not depend on it.")]

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from sdr import jobs
-from sdr.options import Recording
 from sdr.errors import hermite, tracking_errors
+from sdr.options import Recording
 from signals.constants import CHIP_RATE_HZ, METRES_PER_CHIP
 from tracking.loops import dll_jitter_chips, pll_jitter_cycles
 

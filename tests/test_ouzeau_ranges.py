@@ -204,18 +204,6 @@ def test_galileo_plain_fft_misses_a_third_and_the_glrt_nothing():
     assert error < 0.2
 
 
-def test_trials_replay_alone():
-    runs = train_monitors(PATH, MONITORS, TRAIN, 2, 3000)
-    jam = PATH.model_copy(update={"jammers": (TwinCW(js_db=3.0),)})
-    whole = list(simulate_points([PATH, jam], runs, 7, 3, 2000))
-    alone = next(simulate_points([PATH, jam], runs, 7, 1, 2000, first_trial=2))
-    assert (whole[2].point, whole[2].trial) == (0, 2)
-    for name in MONITORS:
-        assert np.array_equal(alone.statistics[name], whole[2].statistics[name])
-    assert np.array_equal(alone.epochs, whole[2].epochs)
-    assert not np.array_equal(whole[0].epochs, whole[3].epochs)
-
-
 def test_summed_dumps():
     z = np.arange(24, dtype=np.complex64).reshape(12, 2)
     assert np.allclose(sum_dumps(z, 5), [[4, 5], [14, 15]])
