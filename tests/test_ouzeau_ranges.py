@@ -72,10 +72,10 @@ def simulate_trial(spec, runs, root, point, trial, n_epochs, dumps):
     return TrialResult(statistics, smoothed, line_offset_hz(spec, epochs["t_s"]))
 
 
-def simulate_points(points, runs, root, n_trials, n_epochs, dumps=1, first_trial=0):
+def simulate_points(points, runs, root, n_trials, n_epochs, dumps=1):
     """All trials of a list of twins, in order."""
     for point, spec in enumerate(points):
-        for trial in range(first_trial, first_trial + n_trials):
+        for trial in range(n_trials):
             yield simulate_trial(spec, runs, root, point, trial, n_epochs, dumps)
 
 
