@@ -60,14 +60,15 @@ MANOEUVRE_S = 5.0
 
 LEFT_OUT = 1e12
 """Factor on the variances of a satellite that a monitor excludes: it weighs nothing and is still steered."""
-N_CN0 = 15
+N_CN0 = 16
 """Columns of what is kept of a channel: prompt power fast and slow, noise power fast, time watched, mean of squared range
 innovations, C/N0 (Hz), signal power remembered from when it was strong; smoothed range and rate, measured minus predicted
-(m, m/s), and the same measured minus NCO; of the pre-filter, weighted sums of innovations and their weights, range and rate."""
+(m, m/s), and the same measured minus NCO; of the pre-filter, weighted sums of innovations and their weights, range and
+rate; noise power slow."""
 P_FAST, P_SLOW, N_FAST, WEIGHT, NIS_MEAN, CN0_HZ, SIGNAL, RANGE_M, RATE_MPS, RANGE_OFF_M, RATE_OFF_MPS = (
     range(11)
 )
-PRE_RANGE, PRE_RANGE_WEIGHT, PRE_RATE, PRE_RATE_WEIGHT = range(11, 15)
+PRE_RANGE, PRE_RANGE_WEIGHT, PRE_RATE, PRE_RATE_WEIGHT, N_SLOW = range(11, 16)
 SURPRISE = 9.0
 """Most that one row counts when the filter is judged as a whole: one bad channel must not condemn it."""
 OBSERVED_HZ = 1.0
@@ -441,14 +442,46 @@ def watch_power(row, prompt_power, noise_power, span_s, fast_s, slow_s):
     w = row[WEIGHT] + span_s
     if prompt_power < 0.1 * row[P_FAST] and row[P_FAST] > STRONG * row[N_FAST]:
         row[P_FAST] = row[P_SLOW] = prompt_power  # a strong signal that is gone is gone at once
+        row[N_SLOW] = row[N_FAST]
         w = 2.0 * span_s
     kf, ks = span_s / min(w, fast_s + span_s), span_s / min(w, slow_s + span_s)
     row[P_FAST] += kf * (prompt_power - row[P_FAST])
     row[P_SLOW] += ks * (prompt_power - row[P_SLOW])
     row[N_FAST] += kf * (noise_power - row[N_FAST])
+    row[N_SLOW] += ks * (noise_power - row[N_SLOW])
     if row[P_SLOW] - row[P_FAST] > CHANGED * scatter(row[P_SLOW], row[N_FAST], kf):
-        row[P_SLOW], w = row[P_FAST], min(w, fast_s)
+        row[P_SLOW], row[N_SLOW], w = row[P_FAST], row[N_FAST], min(w, fast_s)
     row[WEIGHT] = min(w, 1e3)
+
+
+@njit(cache=True, nogil=True)
+def common_gain(power, active, span_s, slow_s, density, work):
+    """Factor g by which all signals together differ from the powers S remembered; 1 where it is that within its scatter.
+
+    One front end has one gain, and where it holds the total power, a jammer makes all signals sink alike: g = sum w (P - N) /
+    sum w S, w = S / var(P - N), of the channels within scatter of their median; those with a noise of their own are left
+    out. Of fewer than four nothing common is known: 1. ``density``: common noise; ``work`` (C,).
+    """
+    count = 0
+    for c in range(active.size):
+        if active[c] and power[c, SIGNAL] > 0.0 and power[c, N_FAST] * span_s[c] <= 2.0 * density:
+            work[count] = (power[c, P_SLOW] - power[c, N_SLOW]) / power[c, SIGNAL]
+            count += 1
+    if count < 4:
+        return 1.0
+    middle = max(np.median(work[:count]), 0.0)
+    total, info = 0.0, 1e-300
+    for c in range(active.size):
+        if active[c] and power[c, SIGNAL] > 0.0 and power[c, N_FAST] * span_s[c] <= 2.0 * density:
+            signal, noise = power[c, SIGNAL], density / span_s[c]
+            k = span_s[c] / min(power[c, WEIGHT], slow_s + span_s[c])
+            var = scatter(middle * signal + noise, noise, k) ** 2 + scatter(noise, noise, k) ** 2
+            excess = power[c, P_SLOW] - power[c, N_SLOW]
+            if (excess - middle * signal) ** 2 < CHANGED**2 * var:
+                total += signal * excess / var
+                info += signal * signal / var
+    gain = max(total / info, 0.0)
+    return 1.0 if abs(gain - 1.0) < CHANGED / math.sqrt(info) else gain
 
 
 @njit(cache=True, nogil=True)
@@ -457,8 +490,8 @@ def cn0_from_powers(power, active, span_s, slow_s, cn0_out):
 
     C/N0 = (P_slow - N) / (N T), N the median of all channels' fast noise, or the own one where it is twice
     that: a jammer that rises is in the common noise at once, one that hits a single code in its own. Once the signal's own
-    power S is known from when it was strong, S / (N T) while P_slow is S + N within scatter: among noise an estimate of its
-    own would scatter to gains and weights that are not there. Never more than S allows.
+    power S is known from when it was strong, g S / (N T) while P_slow is g S + N within scatter, g the ``common_gain``:
+    among noise an estimate of its own would scatter to gains and weights that are not there. Never more than g S allows.
     """
     n = power.shape[0]
     noise = np.empty(n)
@@ -471,6 +504,7 @@ def cn0_from_powers(power, active, span_s, slow_s, cn0_out):
         return
     ordered = np.sort(noise[:count])
     common = ordered[count // 2]
+    gain = common_gain(power, active, span_s, slow_s, common, noise)
     for c in range(n):
         if not active[c]:
             continue
@@ -479,18 +513,20 @@ def cn0_from_powers(power, active, span_s, slow_s, cn0_out):
         prompt, noise_power = power[c, P_SLOW], density / span_s[c]
         value = prompt / max(density, 1e-30) - 1.0 / span_s[c]
         cn0_out[c] = max(value, 0.5)
+        known = gain * power[c, SIGNAL]
         if value * span_s[c] > STRONG and power[c, WEIGHT] > 0.2:
             k = 1.0 if power[c, SIGNAL] == 0.0 else 0.01
-            power[c, SIGNAL] += k * (prompt - noise_power - power[c, SIGNAL])
+            signal = prompt - noise_power
+            # What is remembered is the power at the gain of before, unless this channel alone has changed.
+            signal /= gain if abs(signal - known) < 0.5 * known else 1.0
+            power[c, SIGNAL] += k * (signal - power[c, SIGNAL])
         elif power[c, SIGNAL] > 0.0:
-            there, weight = (
-                power[c, SIGNAL] + noise_power,
-                span_s[c] / min(power[c, WEIGHT], slow_s + span_s[c]),
-            )
+            weight = span_s[c] / min(power[c, WEIGHT], slow_s + span_s[c])
+            there = known + noise_power
             if abs(prompt - there) < CHANGED * scatter(there, noise_power, weight):
-                cn0_out[c] = power[c, SIGNAL] / density
+                cn0_out[c] = max(known / density, 0.5)
             else:
-                cn0_out[c] = min(cn0_out[c], power[c, SIGNAL] / density)
+                cn0_out[c] = max(min(cn0_out[c], known / density), 0.5)
                 if power[c, SIGNAL] > STRONG * noise_power and value * span_s[c] < 1.0:
                     cn0_out[c] = 0.5  # it should stand out and does not: what is left is noise alone
         power[c, CN0_HZ] = cn0_out[c]

@@ -138,6 +138,8 @@ class Trial:
     jam_s: tuple[float, float] = (60.0, 150.0)
     q_db: tuple[float, ...] = ()
     """Effective Q of each satellite, dB; empty: 0."""
+    gain_control: bool = False
+    """The front end's gain holds the noise density of Q = 1: signals sink when a jammer comes."""
     blocked_s: tuple[float, float] = (0.0, 0.0)
     spacing_chips: float = 1.0
     imu: ImuSpec = field(default_factory=lambda: ImuSpec(grade="karaim2020"))
@@ -181,14 +183,15 @@ def run(
     model = build_model(spec, trial.imu, trial.odometer, trial.barometer)
     sensors, per_epoch = _sensors(sky, trial, *children[3:])
     x, p = _start(sky, trial, model, start, bias[0], drift[0])
+    gain = 1.0 / (1.0 + trial.gain_control * cn0[0] * jam / CHIP_RATE_HZ)
     table = discriminator_table("L1CA", trial.spacing_chips)[None]
     aided_run(
         noise, model_code(model), x, p, sensors, per_epoch, T_S / per_epoch, getattr(model, "pitch_filter_s", 1.0),
         model_rates(model, trial.barometer), extended_q(model, x), spec.limit_sigma, policy.fast_s, policy.slow_s, spec.code_floor_m,
         spec.rate_floor_mps, table, policy.sign, 10 ** (policy.fixed_dbhz / 10) if policy.fixed_dbhz > 0 else 0.0,
         policy.use_gain, 10 ** (policy.skip_below_dbhz / 10) if policy.skip_below_dbhz > 0 else 0.0, T_S, half, sky.sat_pos,
-        sky.sat_vel, sky.sat_acc, sky.rho, sky.rate, sky.pos, sky.vel, bias, drift, cn0, jam, q_rc, amplitude, sky.r_le,
-        EVERY, watch, out,
+        sky.sat_vel, sky.sat_acc, sky.rho, sky.rate, sky.pos, sky.vel, bias, drift, cn0, jam, q_rc, amplitude, gain,
+        sky.r_le, EVERY, watch, out,
     )  # fmt: skip
     return out
 

@@ -110,13 +110,13 @@ def _locked(truth):
 @njit(cache=True, nogil=True)
 def aided_run(rng, model, x, p, sensors, per_epoch, dt_s, filter_s, rates, q_diag, limit, fast_s, slow_s, floor_m,
               floor_mps, tables, sign, fixed_hz, use_gain, min_cn0_hz, T, half_space, sat_pos, sat_vel, sat_acc, rho_true,
-              rate_true, pos_true, vel_true, bias, drift, cn0_hz, jam, q_rc, amplitude, r_le, every, watch, out):  # fmt: skip
+              rate_true, pos_true, vel_true, bias, drift, cn0_hz, jam, q_rc, amplitude, gain, r_le, every, watch, out):  # fmt: skip
     """One trial steered by the filter.
 
     Epoch e covers [e T, (e + 1) T]; ``sat_*`` (E + 1, C, 3), ``pos_true``, ``vel_true`` (E + 1, 3) at its ends,
     ``rho_true``, ``rate_true`` (E, C) at its middle without clock; ``bias``, ``drift`` (2 E + 1,) at ends and middles.
     ``fixed_hz`` > 0: R of that C/N0 for ever; ``use_gain`` False: gain 1; ``min_cn0_hz``: weaker channels are skipped.
-    ``sign`` -1 steers the wrong way (for tests).
+    ``gain`` (E,): power gain of the front end. ``sign`` -1 steers the wrong way (for tests).
     """
     count, n = cn0_hz.size, p.shape[0]
     active, second = np.ones(count, np.bool_), np.zeros(count)
@@ -182,7 +182,7 @@ def aided_run(rng, model, x, p, sensors, per_epoch, dt_s, filter_s, rates, q_dia
             rate_mps[c] = -sign * meas[c, 1] * WAVELENGTH_M
             off_m[c] = rho_nco[c] - (rho[c] - 0.5 * T * (rate[c] - 0.25 * T * accel[c]))
             off_mps[c] = rate_nco[c] - (rate[c] - 0.5 * T * accel[c])
-            watch_power(power[c], meas[c, 2], meas[c, 3], T, fast_s, slow_s)
+            watch_power(power[c], gain[e] * meas[c, 2], gain[e] * meas[c, 3], T, fast_s, slow_s)
         cn0_from_powers(power, active, span_s, slow_s, cn0)
         for c in range(count):
             seen[c] = 1 if cn0[c] >= min_cn0_hz else 0

@@ -16,13 +16,14 @@ GRADES = {"riss_sf": "karaim2020", "ecef17": "karaim2020", "pinson13": "navigati
 """Pinson's model has no states for sensor biases: navigation grade."""
 
 
-@pytest.mark.parametrize("js_db", [0.0, 45.0])
+@pytest.mark.parametrize(("js_db", "gain_control"), [(0.0, False), (45.0, False), (45.0, True)])
 @pytest.mark.parametrize("model", list(GRADES))
-def test_nees_and_nis_are_within_their_chi_square_bounds(model, js_db):
+def test_nees_and_nis_are_within_their_chi_square_bounds(model, js_db, gain_control):
     from scipy.stats import chi2
 
     barometer = BarometerSpec() if model == "pinson13" else None
-    trial = Trial(js_db=js_db, jam_s=JAM_S, imu=ImuSpec(grade=GRADES[model]), barometer=barometer)
+    imu = ImuSpec(grade=GRADES[model])
+    trial = Trial(js_db=js_db, jam_s=JAM_S, gain_control=gain_control, imu=imu, barometer=barometer)
     out = batch(karaim.sky(SPAN_S), trial, SteeringSpec(mode="ultra_tight", model=model), N_RUNS, seed=23)
     assert np.all(out[:, -1, 11] == 8)  # locked channels
     # Position (3), clock bias and drift at one instant of each run: independent, 5 degrees of freedom each.

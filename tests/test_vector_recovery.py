@@ -23,7 +23,7 @@ def steering_with(there, n=8, mode="vector"):
     noise = 1.0 / (CN0_HZ * T_S)
     power = run.filter.power[:n]
     power[:, kernels.N_FAST], power[:, kernels.SIGNAL], power[:, kernels.WEIGHT] = noise, 1.0, 10.0
-    power[:, kernels.P_FAST] = power[:, kernels.P_SLOW] = noise
+    power[:, kernels.P_FAST] = power[:, kernels.P_SLOW] = power[:, kernels.N_SLOW] = noise
     power[:there, kernels.P_FAST] = power[:there, kernels.P_SLOW] = 1.0 + noise
     kernels.cn0_from_powers(run.filter.power, run.active, np.full(24, T_S), 1.0, run.filter.cn0)
     return run
@@ -37,7 +37,7 @@ def test_a_strong_signal_that_is_not_there_informs_nothing():
     for known_hz, seen_hz in ((10.0, 10.0), (250.0, 125.0)):
         run = steering_with(0)
         power = run.filter.power[:8]
-        power[:, kernels.N_FAST] = 1.0 / (known_hz * T_S)
+        power[:, kernels.N_FAST] = power[:, kernels.N_SLOW] = 1.0 / (known_hz * T_S)
         power[:, kernels.P_FAST] = power[:, kernels.P_SLOW] = power[:, kernels.N_FAST] + 0.5
         kernels.cn0_from_powers(run.filter.power, run.active, np.full(24, T_S), 1.0, run.filter.cn0)
         assert run.filter.cn0[:8] == pytest.approx(seen_hz, rel=1e-9)
