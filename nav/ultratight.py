@@ -256,7 +256,16 @@ def nominal_of(
 
 
 def start_covariance(
-    model, x, pos_m=5.0, vel_mps=0.3, bias_m=10.0, drift_mps=1.0, heading_rad=0.05, isb_m=10.0, imu=None, fix_m2=None
+    model,
+    x,
+    pos_m=5.0,
+    vel_mps=0.3,
+    bias_m=10.0,
+    drift_mps=1.0,
+    heading_rad=0.05,
+    isb_m=10.0,
+    imu=None,
+    fix_m2=None,
 ):
     """Start covariance (n + 1, n + 1) of true - estimate: a scalar fix, a heading from its velocity, sensors unknown.
 

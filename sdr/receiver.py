@@ -124,6 +124,9 @@ class Receiver:
         # The first slab is what one search takes; after it, slabs divide the time between positions.
         period_s = 1.0 / self.spec.navigation.rate_hz
         per_period = math.ceil(period_s / (self.spec.slab_ms * 1e-3) - 1e-9)
+        if self.flags.names and self.steering is not None:
+            # The monitors' flags are to hold at the filter's next update, not a slab later.
+            per_period = max(per_period, round(self.spec.steering.update_hz * period_s))
         ends = (round(k * period_s / per_period * self.fs_hz) for k in count(1))
         for k, end in enumerate(ends, 1):
             if self.position == 0 and self._wanted < end:
