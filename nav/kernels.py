@@ -111,6 +111,40 @@ def normal_equations(los, second, variance, residual, use, m, normal, right):
 
 
 @njit(cache=True, nogil=True)
+def time_error(los, second, variance, residual, use, m, sat_vel):
+    """What ``pvt.time_error`` returns: the residual and u . v of each row, both less what the m unknowns can explain."""
+    n = los.shape[0]
+    slide = np.empty(n)
+    for i in range(n):
+        slide[i] = los[i, 0] * sat_vel[i, 0] + los[i, 1] * sat_vel[i, 1] + los[i, 2] * sat_vel[i, 2]
+    h, normal, inverse, by_residual, by_slide = (
+        np.zeros(5), np.zeros((5, 5)), np.zeros((5, 5)), np.zeros(5), np.zeros(5)
+    )  # fmt: skip
+    normal_equations(los, second, variance, slide, use, m, normal, by_slide)
+    normal_equations(los, second, variance, residual, use, m, normal, by_residual)
+    if not invert_symmetric(normal, inverse, m):
+        return math.nan, math.nan, math.nan, math.nan, math.nan
+    x, x_slide = inverse @ by_residual, inverse @ by_slide
+    power = cross = chi2 = most = 0.0
+    for i in range(n):
+        if use[i] == 0:
+            continue
+        _design_row(los, second, i, m, h)
+        w = 1.0 / variance[i]
+        y, s, free = residual[i], slide[i], 1.0
+        for a in range(m):
+            y -= h[a] * x[a]
+            s -= h[a] * x_slide[a]
+            for b in range(m):
+                free -= h[a] * inverse[a, b] * h[b] * w
+        power, cross, chi2 = power + w * s * s, cross + w * s * y, chi2 + w * y * y
+        if free > 1e-9:
+            most = max(most, w * y * y / free)
+    tau_s = cross / power
+    return tau_s, 1.0 / math.sqrt(power), chi2, chi2 - tau_s * cross, chi2 - most
+
+
+@njit(cache=True, nogil=True)
 def solve_position(sat_pos, measured, variance, second, use, m, state, cov, residual, los, max_iterations):
     """Gauss-Newton weighted least squares for position, clock bias and (m = 5) inter-system bias.
 

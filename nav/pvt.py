@@ -264,19 +264,11 @@ def time_error(sats, los, variance, second, use, residual_m, m):
 
     Returns
     -------
-    (tau_s, sigma_s, chi2 without this unknown, chi2 with it, chi2 with the one satellite left out that lowers it most).
+    (tau_s, sigma_s, chi2 without this unknown, chi2 with it, chi2 with the one satellite left out that lowers it most);
+    all NaN where the geometry fixes no position.
     """
-    part, root = use == 1, 1.0 / np.sqrt(variance[use == 1])
-    columns = np.column_stack([los[part], np.ones(part.sum()), second[part]])[:, :m] * root[:, None]
-    basis, _ = np.linalg.qr(columns)
-    slide = np.einsum("ij,ij->i", los[part], sats["vel_ecef_mps"][part]) * root
-    y = residual_m[part] * root
-    slide, y = slide - basis @ (basis.T @ slide), y - basis @ (basis.T @ y)
-    power, chi2 = float(slide @ slide), float(y @ y)
-    tau_s = float(slide @ y) / power
-    free = 1.0 - np.sum(basis**2, axis=1)
-    without = chi2 - float(np.max(np.where(free > 1e-9, y**2 / np.maximum(free, 1e-9), 0.0)))
-    return tau_s, 1.0 / math.sqrt(power), chi2, chi2 - tau_s**2 * power, without
+    vel = np.ascontiguousarray(sats["vel_ecef_mps"])
+    return kernels.time_error(los, second, variance, residual_m, use, m, vel)
 
 
 def refuse_late(sats, los, variance, second, use, residual_m, m, p_fa, doubted):

@@ -44,17 +44,19 @@ class Holes:
 
     def hear(self, heard: list[tuple[int, np.ndarray, np.ndarray]]) -> bool:
         """(channel, EPOCH rows, ..) of a slab -> whether most locked channels began to be disturbed together in it."""
-        locked = 0
         begun: list[int] = []
         for c, epochs, _ in heard:
-            own = epochs[(epochs["state"] == STATE_LOCKED) & (epochs["pll_bw_hz"] > 0)]
-            locked += len(own) > 0
-            bad = own[np.abs(own["phase_error_cycles"]) > DISTURBED_CYCLES]
-            for sample in bad["sample_index"].tolist():
+            if not np.any(np.abs(epochs["phase_error_cycles"]) > DISTURBED_CYCLES):
+                continue
+            own = _followed(epochs)
+            for sample in own["sample_index"][np.abs(own["phase_error_cycles"]) > DISTURBED_CYCLES].tolist():
                 if sample - self._last.get(c, -(1 << 62)) > CALM_S * self.fs_hz:
                     self._began[c] = sample
                     begun.append(sample)
                 self._last[c] = sample
+        if not begun:
+            return False
+        locked = sum(len(_followed(epochs)) > 0 for _, epochs, _ in heard)
         recent = sorted(self._began.values())
         for first in begun:
             near = [s for s in recent if abs(s - first) < TOGETHER_S * self.fs_hz]
@@ -81,6 +83,11 @@ class Holes:
     def settle(self) -> None:
         """Messages have confirmed the time of all satellites: what was disturbed before is past."""
         self._disturbed.clear()
+
+
+def _followed(epochs: np.ndarray) -> np.ndarray:
+    """EPOCH rows whose carrier the channel's own loop has locked."""
+    return epochs[(epochs["state"] == STATE_LOCKED) & (epochs["pll_bw_hz"] > 0)]
 
 
 def told(holes: np.ndarray) -> list[dict[str, float]]:
