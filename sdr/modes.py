@@ -158,7 +158,7 @@ class SideBySide:
     # -- report ---------------------------------------------------------------------------------------------------
 
     def tracks(self) -> dict[str, np.ndarray]:
-        """TRACK rows of every receiver from the time on when all have had a position for 5 s."""
+        """TRACK rows of every receiver, where the scalar one has positions, from the time on when all have had one for 5 s."""
         firsts = []
         for mode, rows in self.solutions.items():
             valid = [r for r in rows if r["valid"][0]]
@@ -167,7 +167,9 @@ class SideBySide:
             began = self.steering[mode][0]["t_s"][0] if self.steering[mode] else valid[0]["t_s"][0]
             firsts.append(max(float(valid[0]["t_s"][0]), float(began)))
         end_s = self.primary.position / self.fs_hz
-        t = np.arange(math.ceil(10 * (max(firsts) + 5.0)), math.floor(10 * end_s) + 1) / 10
+        # In between, a position's velocity would count as wrong by how much it changed since.
+        rate_hz = self.primary.spec.navigation.rate_hz
+        t = np.arange(math.ceil(rate_hz * (max(firsts) + 5.0)), math.floor(rate_hz * end_s) + 1) / rate_hz
         return {mode: self._track(mode, t) for mode in self.solutions}
 
     def _track(self, mode: str, t: np.ndarray) -> np.ndarray:

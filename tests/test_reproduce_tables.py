@@ -5,6 +5,7 @@ import json
 
 import pytest
 
+from monitors.detection import clopper_pearson
 from sdr import reproduce
 
 
@@ -31,12 +32,12 @@ def test_unknown_verdict_is_refused():
 def test_clopper_pearson_against_its_definition():
     from scipy.stats import binom
 
-    low, high = reproduce.clopper_pearson(3, 20)
+    low, high = clopper_pearson(3, 20)
     assert binom.sf(2, 20, low) == pytest.approx(0.025, rel=1e-6)
     assert binom.cdf(3, 20, high) == pytest.approx(0.025, rel=1e-6)
-    assert reproduce.clopper_pearson(0, 10) == (0.0, pytest.approx(1 - 0.025 ** (1 / 10)))
+    assert clopper_pearson(0, 10) == (0.0, pytest.approx(1 - 0.025 ** (1 / 10)))
     with pytest.raises(ValueError, match="events"):
-        reproduce.clopper_pearson(3, 2)
+        clopper_pearson(3, 2)
 
 
 @pytest.mark.slow
