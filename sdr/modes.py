@@ -23,7 +23,7 @@ PULL_IN_HZ = 25.0
 """A satellite is lost when its replica is off by more than half a chip or this."""
 
 TRACK = np.dtype([("t_s", "f8"), ("error_2d_m", "f8"), ("error_speed_mps", "f8"), ("valid", "?")])
-"""Position error of one receiver at 10 Hz; where it has no valid position its last one is held."""
+"""Position error of one receiver at the rate of its positions; where it has no valid one its last is held."""
 
 
 class Tee:
@@ -203,7 +203,7 @@ class SideBySide:
         after = np.flatnonzero((t > stop) & ~good)
         recovered: float | None = None
         if self.jam_s and good[-1] and t[-1] > stop:
-            recovered = float(t[after[-1]] - stop + 0.1) if after.size else 0.0
+            recovered = float(t[after[-1] + 1] - stop) if after.size else 0.0
         return {
             "rms_2d_m": rms(e), "max_2d_m": float(e.max()), "rms_jam_2d_m": rms(e[jam]),
             "rms_speed_mps": rms(track["error_speed_mps"]), "satellites_lost": self.lost.get(mode),

@@ -104,3 +104,19 @@ def test_a_vector_receiver_pushed_off_its_satellites_finds_back():
     assert numbers["max_2d_m"] > 300
     assert numbers["satellites_lost"] >= 5
     assert numbers["recovered_s"] is not None and numbers["recovered_s"] < 40
+
+
+def test_recovery_lasts_to_the_first_position_that_stays_good():
+    """Jam from 10 to 20 s, positions each 0.2 s, 100 m off from 10.2 to 22.2 s, good once within: back after 2.4 s."""
+    from sdr.modes import TRACK, SideBySide
+
+    side = SideBySide.__new__(SideBySide)
+    side.jam_s, side.lost, side._tracked = (10.0, 20.0), {}, {}
+    track = np.zeros(200, TRACK)
+    track["t_s"], track["valid"] = np.arange(200) / 5, True
+    track["error_2d_m"] = np.where((track["t_s"] > 10.1) & (track["t_s"] < 22.3), 100.0, 1.0)
+    track["error_2d_m"][105] = 1.0
+    numbers = side._numbers("scalar", track)
+    assert numbers["recovered_s"] == pytest.approx(2.4) and numbers["satellites"] is None
+    track["error_2d_m"][-1] = 100.0
+    assert side._numbers("scalar", track)["recovered_s"] is None
