@@ -274,8 +274,9 @@ def time_error(sats, los, variance, second, use, residual_m, m):
 def refuse_late(sats, los, variance, second, use, residual_m, m, p_fa, doubted):
     """Raise Late where one error of all transmit times explains the ranges: samples are missing.
 
-    Without doubt of the time, the ranges must fail their test (chi-square, ``p_fa``), pass it with this unknown, and gain
-    more by it than by any satellite left out; in doubt (a disturbance of all channels, and no message since) it is
+    Without doubt of the time, the ranges must fail their test (chi-square, ``p_fa``), pass it with this unknown, gain
+    more by it than by any satellite left out, and as significantly against the scatter that is left, for noise may be larger
+    than is believed; in doubt (a disturbance of all channels, and no message since) it is
     enough that the unknown itself is significant, and without redundancy there is no fix.
     """
     dof = int(use.sum()) - m
@@ -289,11 +290,12 @@ def refuse_late(sats, los, variance, second, use, residual_m, m, p_fa, doubted):
     tau_s, sigma_s, chi2, rest, without = time_error(sats, los, variance, second, use, residual_m, m)
     if abs(tau_s) < LATE_S or rest > chi2_threshold(dof - 1, p_fa):
         return
-    fails = chi2 > chi2_threshold(dof, p_fa) and rest < without
-    if fails or (doubted and chi2 - rest > chi2_threshold(1, p_fa)):
+    gain, least = chi2 - rest, chi2_threshold(1, p_fa)
+    fails = chi2 > chi2_threshold(dof, p_fa) and rest < without and gain > least * max(1.0, rest / (dof - 1))
+    if fails or (doubted and gain > least):
         raise Late(
-            f"the ranges fit together only if time is off by {tau_s * 1e3:.0f} ± {sigma_s * 1e3:.0f} ms: samples are "
-            "missing, and the position waits for the time in the messages."
+            f"the ranges fit together only if time is off by {tau_s * 1e3:.0f} ± {sigma_s * 1e3:.0f} ms: samples seem "
+            "to be missing, and the position waits for the time in the messages."
         )
 
 
