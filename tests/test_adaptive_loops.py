@@ -208,10 +208,9 @@ def test_what_a_monitor_asks_for_counts_as_noise():
         np.testing.assert_allclose(part, loops.adapted_pll_bw_hz(cn0, T, jerk), rtol=0.05)
 
 
-@pytest.mark.parametrize(("weaken", "slab_s"), [('["cw"]', 0.02), ("[]", 0.2)])
-def test_flags_hold_at_the_next_update_of_a_steering_filter(weaken, slab_s):
-    """Slabs are as short as the updates where monitors may flag, and no shorter where nothing comes back."""
-    text = f"""
+def flagged(receiver):
+    """A receiver whose `cw` monitor may flag, with more of its settings, and its samples' rate."""
+    text = """
         schema = 1
         name = "flags"
         duration_s = 1.0
@@ -219,46 +218,39 @@ def test_flags_hold_at_the_next_update_of_a_steering_filter(weaken, slab_s):
         start = 2024-03-01T12:00:00
         [receiver.acquisition]
         systems = ["G"]
-        [receiver.steering]
-        mode = "vector"
-        [[receiver.monitor]]
-        name = "cw"
-        detector = {{ kind = "FFT" }}
-        [receiver.tracking.l1ca.taps]
-        count = 35
-        spacing_chips = 0.65
-        [receiver.respond]
-        weaken = {weaken}
-    """
-    spec = scenario.parse(text, "flags")
-    fs_hz = spec.front_end.fs_hz
-    ends = [out.n_end for out in Receiver(spec.receiver, scenario.source(spec))]
-    assert np.max(np.diff(ends)) == round(slab_s * fs_hz)
-
-
-def test_flags_and_variances_reach_the_loops_one_slab_later():
-    text = """
-        name = "flags"
-        duration_s = 1.0
-        [sky]
-        start = 2024-03-01T12:00:00
-        [receiver.acquisition]
-        systems = ["G"]
-        [receiver.tracking.l1ca]
-        adapt = {}
         [[receiver.monitor]]
         name = "cw"
         detector = { kind = "FFT" }
         [receiver.tracking.l1ca.taps]
         count = 35
         spacing_chips = 0.65
+    """
+    spec = scenario.parse(text + receiver, "flags")
+    return Receiver(spec.receiver, scenario.source(spec)), spec.front_end.fs_hz
+
+
+@pytest.mark.parametrize(("weaken", "slab_s"), [('["cw"]', 0.02), ("[]", 0.2)])
+def test_flags_hold_at_the_next_update_of_a_steering_filter(weaken, slab_s):
+    """Slabs are as short as the updates where monitors may flag, and no shorter where nothing comes back."""
+    receiver, fs_hz = flagged(f"""
+        [receiver.steering]
+        mode = "vector"
+        [receiver.respond]
+        weaken = {weaken}
+    """)
+    ends = [out.n_end for out in receiver]
+    assert np.max(np.diff(ends)) == round(slab_s * fs_hz)
+
+
+def test_flags_and_variances_reach_the_loops_one_slab_later():
+    receiver, fs_hz = flagged("""
+        [receiver.tracking.l1ca]
+        adapt = {}
         [receiver.respond]
         weaken = ["cw"]
         weaken_by = 50.0
-    """
-    spec = scenario.parse(text, "flags")
-    receiver = Receiver(spec.receiver, scenario.source(spec))
-    sat = Satellite("L1CA", 7, spec.front_end.fs_hz)
+    """)
+    sat = Satellite("L1CA", 7, fs_hz)
     receiver.channel_of["L1CA", 7] = receiver.tracker.add(sat.acquisition())
     assert receiver._commands(0)["weaken"].tolist() == [0.0]
     receiver.flags._until[b"G", 7] = 10

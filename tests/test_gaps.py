@@ -72,16 +72,21 @@ def test_a_gap_is_told_and_no_position_is_wrong(system, gap_s, n_satellites):
     assert GAP_AT_S[system] < hole["seen_s"] < GAP_AT_S[system] + right_s
 
 
-def test_a_common_error_of_time_is_told_from_one_wrong_range():
-    """Eight satellites, ranges of 1 m noise: 40 ms late on all is one unknown, 60 m on one is not."""
-    rng = np.random.default_rng(5)
+def eight_satellites(rng):
+    """(SATELLITE rows, unit vectors, metres a second of an error of time, design rows) of a random sky."""
     sats, n = np.zeros(8, SATELLITE), 8
     los = rng.standard_normal((n, 3))
     los[:, 2] = np.abs(los[:, 2])
     los /= np.linalg.norm(los, axis=1, keepdims=True)
     sats["vel_ecef_mps"] = 3000.0 * rng.standard_normal((n, 3)) / np.sqrt(3)
     slide = np.einsum("ij,ij->i", los, sats["vel_ecef_mps"])
-    h = np.column_stack([-los, np.ones(n)])
+    return sats, los, slide, np.column_stack([-los, np.ones(n)])
+
+
+def test_a_common_error_of_time_is_told_from_one_wrong_range():
+    """Eight satellites, ranges of 1 m noise: 40 ms late on all is one unknown, 60 m on one is not."""
+    rng, n = np.random.default_rng(5), 8
+    sats, los, slide, h = eight_satellites(rng)
     state = np.array([30.0, -20.0, 10.0, 1e3])
     noise, one = rng.standard_normal(n), np.eye(n)[3]
     args = sats, los, np.ones(n), np.zeros(n), np.ones(n, np.uint8)
@@ -99,3 +104,22 @@ def test_a_common_error_of_time_is_told_from_one_wrong_range():
                 pvt.refuse_late(*args, y, 4, 1e-5, False)
         else:
             pvt.refuse_late(*args, y, 4, 1e-5, False)
+
+
+@pytest.mark.parametrize("sigma_m", [1.0, 2.0, 3.0, 5.0])
+def test_noise_larger_than_believed_is_seldom_an_error_of_time(sigma_m):
+    """1 m believed: the gain over the scatter left is F(1, dof - 1) whatever the noise, and must pass chi-square's quantile."""
+    from scipy.stats import f
+
+    rng, n, trials, p_fa = np.random.default_rng(11), 8, 3000, 1e-5
+    late = 0
+    for _ in range(trials):
+        sats, los, _, _ = eight_satellites(rng)
+        try:
+            pvt.refuse_late(
+                sats, los, np.ones(n), np.zeros(n), np.ones(n, np.uint8), sigma_m * rng.standard_normal(n), 4, p_fa, False
+            )  # fmt: skip
+        except pvt.Late:
+            late += 1
+    most = float(f.sf(pvt.chi2_threshold(1, p_fa), 1, n - 4 - 1))
+    assert late <= trials * most + 5 * np.sqrt(trials * most)
