@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 from nav.eskf import EpochLog
 
 RATE_SIGMA_MPS = 1.0
-"""A priori sigma of a drifting offset: the ramps of seed 001, 0.5 to 2 ft/s, and more."""
+"""A priori sigma of a drifting offset: the ramps of Vanek 1999, 0.5 to 2 ft/s, and more."""
 RECENT, SPARSE = 50, 4
 """An onset may be any of the last so many epochs; before them, every so manieth."""
 NEGLIGIBLE = 1e-9

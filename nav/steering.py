@@ -7,6 +7,7 @@ the next scalar fix starts it anew. Nothing diverges silently.
 
 import math
 from bisect import bisect_right
+from collections import deque
 from dataclasses import dataclass
 from typing import Any
 
@@ -117,7 +118,7 @@ class Steering:
         self._table = np.zeros((0, kernels.N_SENSOR))
         self._sensor_sample: list[int] = []
         self.axes = "not observable"
-        self._moves: list[tuple[float, ...]] = []
+        self._moves: deque[tuple[float, ...]] = deque(maxlen=AXES_ROWS)
         if spec.mode == "ultra_tight":
             self._read_sensors()
         self._tables = np.stack(
@@ -231,7 +232,8 @@ class Steering:
         )  # fmt: skip
         barometer = self.sensors.barometer_spec if self.sensors else None
         self.filter = Filter(self.spec, self.model, x, p, SLOTS, self.log_length, barometer)
-        self._estimate_isb, self._moves = False, []
+        self._estimate_isb = False
+        self._moves.clear()
 
     def meet(self, isb_m: float | None) -> None:
         """Learn Galileo's clock minus GPS's from the position stage; until then only the first system is steered."""
@@ -461,7 +463,7 @@ class Steering:
         last = bisect_right(self._sensor_sample, sample + 1)
         mean = self._table[max(last - round(REPORT_S / self.dt_s), 0) : last].mean(axis=0)
         speed = float(np.linalg.norm(self.filter.position()[1]))
-        self._moves = [*self._moves[1 - AXES_ROWS :], (mean[3], mean[4], mean[2], speed)]
+        self._moves.append((mean[3], mean[4], mean[2], speed))
         if self.due(AXES_S):
             self._check_axes()
 

@@ -156,10 +156,11 @@ class Receiver:
             self._decode()
         self.position = n_end
         out.epochs = rows = [(c, epochs[c, :n], corr[c, :n]) for c, n in enumerate(counts) if n]
-        for c, mine, _ in () if stops else rows:
-            self.drift.hear(self.tracker.channels["signal"][c].decode(), mine)
-        if not self._steered and self.holes.hear(rows):
-            self._doubt()
+        if not stops:  # a steered replica says nothing of its own
+            for c, mine, _ in rows:
+                self.drift.hear(self.tracker.channels["signal"][c].decode(), mine)
+            if self.holes.hear(rows):
+                self._doubt()
         if self.integrity is not None:
             self.integrity.hear(self.channel_of, epochs, counts, self.spec.tracking)
         if n_end in stops:
