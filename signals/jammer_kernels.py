@@ -273,6 +273,13 @@ def _moves(carrier, c, n_cell):
     return (abs(carrier[c, 2]) + 1.5 * abs(carrier[c, 3])) * (SUB / 2) > STEADY * n_cell
 
 
+@njit(cache=True, nogil=True, forceinline=True)
+def _carrier(base, at, re, im):
+    """Cosine and sine of rot base at one point."""
+    x, y = base[at], base[at + _Q(SUB)]
+    return re * x - im * y, re * y + im * x
+
+
 @njit(cache=True, nogil=True, fastmath=_FAST)
 def _add_steady(out_i, out_q, base, at_base, rot_i, rot_q, at_rot, begin, end):
     """out[begin .. end) += rot base."""
@@ -283,10 +290,9 @@ def _add_steady(out_i, out_q, base, at_base, rot_i, rot_q, at_rot, begin, end):
         o, c = _Q(k0), b + _Q(k0 - sub * SUB)
         for m in range(k1 - k0):
             k = _Q(m)
-            x = base[c + k]
-            y = base[c + k + _Q(SUB)]
-            out_i[o + k] += re * x - im * y
-            out_q[o + k] += re * y + im * x
+            cosine, sine = _carrier(base, c + k, re, im)
+            out_i[o + k] += cosine
+            out_q[o + k] += sine
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST)
@@ -297,9 +303,7 @@ def _add_turned(out_i, out_q, x_i, x_q, at, base, at_base, rot_i, rot_q, at_rot)
         o, re, im = _Q(sub * SUB), rot_i[at_rot + sub], rot_q[at_rot + sub]
         for m in range(SUB):
             k = _Q(m)
-            x = base[b + k]
-            y = base[b + k + _Q(SUB)]
-            c, s = re * x - im * y, re * y + im * x
+            c, s = _carrier(base, b + k, re, im)
             u, v = x_i[_Q(at) + o + k], x_q[_Q(at) + o + k]
             out_i[o + k] += u * c - v * s
             out_q[o + k] += u * s + v * c
@@ -409,10 +413,9 @@ def _add_bell(out_i, out_q, bell, k0, k1, base, at_base, rot_i, rot_q, at_rot):
         o, b, c = _Q(begin), _Q(begin - k0), _Q(at_base + begin - sub * SUB)
         for m in range(end - begin):
             k = _Q(m)
-            x = base[c + k]
-            y = base[c + k + _Q(SUB)]
-            out_i[o + k] += bell[b + k] * (re * x - im * y)
-            out_q[o + k] += bell[b + k] * (re * y + im * x)
+            cosine, sine = _carrier(base, c + k, re, im)
+            out_i[o + k] += bell[b + k] * cosine
+            out_q[o + k] += bell[b + k] * sine
 
 
 @njit(cache=True, nogil=True, forceinline=True)
@@ -537,9 +540,7 @@ def _add_filtered(out_i, out_q, x_i, x_q, at, taps, t, base, at_base, rot_i, rot
         o, re, im = _Q(sub * SUB), rot_i[at_rot + sub], rot_q[at_rot + sub]
         for m in range(SUB):
             k = _Q(m)
-            x = base[b + k]
-            y = base[b + k + _Q(SUB)]
-            c, s = re * x - im * y, re * y + im * x
+            c, s = _carrier(base, b + k, re, im)
             j, _ = _folded(x_i, _Q(at) + o + k)
             r, _ = _folded(x_q, _Q(at) + o + k)
             u, v = _even(e, j), _even(e, r)
