@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numba.core.event import TimingListener, install_listener
 
 from nav.sensor_files import write_barometer, write_imu, write_odometer
 from nav.steering import Sensors
@@ -247,9 +248,12 @@ def _receive(
         receiver.source = spectra["mitigation/spectrum"] = Spectrogram(receiver.mitigation)
     truth = _Truth(source, store)
     tally = _Tally()
-    begin = time.perf_counter()
+    begin, compiling = time.perf_counter(), TimingListener()
     try:
-        with progress(label, source.n_samples, quiet) as advance:
+        with (
+            progress(label, source.n_samples, quiet) as advance,
+            install_listener("numba:compile", compiling),
+        ):
             for outcome in receiver:
                 _store_outcome(store, receiver, outcome, tally)
                 if side:
@@ -268,6 +272,7 @@ def _receive(
     result: dict[str, Any] = {
         "duration_s": duration_s,
         "real_time_factor": duration_s / (time.perf_counter() - begin),
+        "compiling_s": compiling.duration if compiling.done else 0.0,
         "satellites": receiver.satellites(tally.locked_s),
         "monitors": _monitors(receiver, source),
         "protection": tally.stanford(source, receiver),
@@ -477,6 +482,8 @@ def _finish(result: dict[str, Any], path: Path, plots: bool) -> dict[str, Any]:
 
 def _summary(result: dict[str, Any]) -> str:
     rows = [f"{result['duration_s']:g} s in {result['real_time_factor']:.1f} times real time"]
+    if result["compiling_s"] >= 1.0:
+        rows[0] += f"; {result['compiling_s']:.0f} s of it compiled kernels, which are kept for the next run"
     rows.append(f"{'satellite':>10} {'locked (s)':>10} {'Doppler (Hz)':>13} {'C/N0 (dB-Hz)':>13}  message")
     for s in result["satellites"]:
         numbers = (

@@ -54,6 +54,29 @@ def test_json_is_one_object_and_nothing_else(tmp_path):
     assert "too short" in result["no_fix_reason"]
 
 
+def test_time_spent_on_compiling_is_told_apart(tmp_path, monkeypatch):
+    """Whoever runs it first waits for the compiler: a kernel that is new in the middle of a run is in the summary, else nothing is."""
+    import contextlib
+
+    from numba import njit
+
+    from sdr import jobs
+
+    @contextlib.contextmanager
+    def watched(label, total, quiet):
+        new = njit(lambda x: x + 1.0)
+        yield lambda done, note="": new(float(done))
+
+    short = {"overrides": ["duration_s=1"], "output": tmp_path / "a.h5", "quiet": True}
+    jobs.run("demo", **short)
+    warm = jobs.run("demo", **short)
+    monkeypatch.setattr(jobs, "progress", watched)
+    new = jobs.run("demo", **short)
+    assert warm["compiling_s"] == 0.0 < new["compiling_s"]
+    assert "compiled" not in warm["text"]
+    assert "; 58 s of it compiled kernels" in jobs._summary(new | {"compiling_s": 57.6})
+
+
 def test_no_satellite_says_what_was_searched(noise, tmp_path):
     done = gnssbb("receive", noise, "--format", "ci8", "--fs-hz", "4e6", "-o", tmp_path / "a.h5", "--json")
     assert done.returncode == 0, done.stderr
